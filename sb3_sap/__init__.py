@@ -1,3 +1,36 @@
 """A Stable-Baselines3 extension that learns which actions are permissible while it learns to act."""
 
+from sb3_sap.algorithms import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2
+from sb3_sap.buffers import (
+    KnowledgeMixin,
+    PermissibilityDictReplayBuffer,
+    PermissibilityHerReplayBuffer,
+    PermissibilityNStepReplayBuffer,
+    PermissibilityReplayBuffer,
+)
+from sb3_sap.callbacks import PermissibilityCallback
+from sb3_sap.constraints import ConstrainedExplorationMixin
+from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.knowledge import KnowledgeBuffer
+from sb3_sap.permissibility import ActionPermissibility
+from sb3_sap.predictor import PermissibilityPredictor
+
 __version__ = "0.1.0"
+__all__ = [
+    "DDPG",
+    "DDPGAP",
+    "DDPGAPCE2",
+    "DDPGCE1",
+    "DDPGCE2",
+    "ActionPermissibility",
+    "ActionPermissibilityMixin",
+    "ConstrainedExplorationMixin",
+    "KnowledgeBuffer",
+    "KnowledgeMixin",
+    "PermissibilityCallback",
+    "PermissibilityDictReplayBuffer",
+    "PermissibilityHerReplayBuffer",
+    "PermissibilityNStepReplayBuffer",
+    "PermissibilityPredictor",
+    "PermissibilityReplayBuffer",
+]

@@ -1,0 +1,51 @@
+"""The algorithms a user names: the paper's DDPG-AP and its baselines (section 5.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stable_baselines3 import DDPG as PlainDDPG
+
+from sb3_sap.constraints import ActionConstraint, ConstrainedExplorationMixin
+from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.settings import SettingsMixin
+
+#: The lane-keeping rules of section 5.1, by name: the algorithms know no environment.
+CE1 = "sb3_sap.envs.lane_keeping.constraint_ce1"
+CE2 = "sb3_sap.envs.lane_keeping.constraint_ce2"
+
+
+class DDPG(SettingsMixin, PlainDDPG):
+    """SB3's DDPG with the settings of :class:`~sb3_sap.settings.SettingsMixin`; without them equal to the bit."""
+
+
+class DDPGAP(ActionPermissibilityMixin, PlainDDPG):
+    """DDPG-AP: DDPG guided by action permissibility (Algorithm 1).
+
+    Paper: Mazumder et al., "Action Permissibility in Deep Reinforcement Learning and Application to Autonomous
+    Driving", KDD'18 Deep Learning Day.
+
+    The parameters are those of SB3's ``DDPG`` and of
+    :class:`~sb3_sap.exploration.ActionPermissibilityMixin`.
+    """
+
+
+class DDPGCE1(ConstrainedExplorationMixin, PlainDDPG):
+    """DDPG-CE1: on the left of the centre line never steer further left than before, on the right never right."""
+
+    def __init__(self, *args: Any, constraint: ActionConstraint | str = CE1, **kwargs: Any):
+        super().__init__(*args, constraint=constraint, **kwargs)
+
+
+class DDPGCE2(ConstrainedExplorationMixin, PlainDDPG):
+    """DDPG-CE2: the rule of DDPG-CE1, while the car moves away from the centre line."""
+
+    def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
+        super().__init__(*args, constraint=constraint, **kwargs)
+
+
+class DDPGAPCE2(ActionPermissibilityMixin, PlainDDPG):
+    """DDPG-(AP+CE2): the rule of DDPG-CE2 bounds the actions, and the candidates that E filters."""
+
+    def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
+        super().__init__(*args, constraint=constraint, **kwargs)

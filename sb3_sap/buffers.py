@@ -1,0 +1,107 @@
+"""The replay buffers R that feed the knowledge buffer K as well."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_sap.knowledge import KnowledgeBuffer
+from sb3_sap.permissibility import APFunction, labels_from_function, labels_from_infos
+
+
+class KnowledgeMixin(ReplayBuffer):
+    """Makes any SB3 replay buffer R feed K as well; K is saved and loaded with it.
+
+    :param knowledge: K, filled with every transition added
+    :param ap_function: labels the transitions; without it the label is taken from ``info["permissible"]``
+    """
+
+    def __init__(
+        self, *args: Any, knowledge: KnowledgeBuffer | None = None, ap_function: APFunction | None = None, **kwargs: Any
+    ):
+        if knowledge is None:
+            raise TypeError(
+                f"A {type(self).__name__} needs `knowledge=KnowledgeBuffer(...)`, which a guided algorithm gives it: "
+                "if this came from loading a model, load it with the class that saved it, such as `DDPGAP.load`."
+            )
+        super().__init__(*args, **kwargs)
+        self.knowledge = knowledge
+        self.ap_function = ap_function
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray[Any, Any],
+        reward: np.ndarray[Any, Any],
+        done: np.ndarray[Any, Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # SB3 hands over raw observations, and the true last one of an episode: here a label is right.
+        if self.ap_function is None:
+            labels = labels_from_infos(infos)
+        else:
+            labels = labels_from_function(self.ap_function, obs, self._unscale(action), next_obs)
+        self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        if not isinstance(self.action_space, spaces.Box):
+            return action
+        low, high = self.action_space.low, self.action_space.high
+        return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The AP function is the model's; the file holds data alone.
+        return {**super().__getstate__(), "ap_function": None}  # type: ignore[dict-item]
+
+
+class PermissibilityReplayBuffer(KnowledgeMixin, ReplayBuffer):
+    """SB3's replay buffer R that also feeds K."""
+
+
+class PermissibilityDictReplayBuffer(KnowledgeMixin, DictReplayBuffer):
+    """The same for ``Dict`` observations."""
+
+
+class PermissibilityNStepReplayBuffer(KnowledgeMixin, NStepReplayBuffer):
+    """The same with n-step returns."""
+
+
+class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
+    """The same with hindsight goals; K keeps the goals that were pursued."""
+
+
+#: What takes the place of each of SB3's buffers in a guided algorithm.
+GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
+    ReplayBuffer: PermissibilityReplayBuffer,
+    DictReplayBuffer: PermissibilityDictReplayBuffer,
+    NStepReplayBuffer: PermissibilityNStepReplayBuffer,
+    HerReplayBuffer: PermissibilityHerReplayBuffer,
+}
+
+
+def guided_buffer_class(
+    requested: type[ReplayBuffer] | None, observation_space: spaces.Space[Any], n_steps: int
+) -> type[KnowledgeMixin]:
+    """The buffer class that SB3 would have chosen, or that the user asked for, in the form that feeds K."""
+    if requested is None:
+        plain = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
+        requested = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else plain
+    guided = GUIDED_BUFFERS.get(requested, requested)
+    if not issubclass(guided, KnowledgeMixin):
+        known = ", ".join(cls.__name__ for cls in GUIDED_BUFFERS)
+        raise ValueError(
+            f"`replay_buffer_class` = {requested.__name__} does not feed the knowledge buffer: use one of {known}, "
+            f"or derive your own as `class Mine(KnowledgeMixin, {requested.__name__})`."
+        )
+    if n_steps > 1 and not issubclass(guided, NStepReplayBuffer):
+        raise ValueError(
+            f"`n_steps` = {n_steps} cannot be combined with {requested.__name__}, which knows one-step returns alone: "
+            "use `n_steps=1`, or array observations and no `replay_buffer_class`."
+        )
+    return guided

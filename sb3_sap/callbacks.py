@@ -1,0 +1,99 @@
+"""Trains and validates the AP predictor beside the agent (section 4.2) and sets α (section 4.3)."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+
+from sb3_sap.buffers import KnowledgeMixin
+from sb3_sap.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
+
+if TYPE_CHECKING:
+    from sb3_sap.exploration import ActionPermissibilityMixin
+
+#: Labels of one class alone, after which the user is told that the AP function separates nothing.
+CONSTANT_LABELS_WARNING = 1_000
+
+
+class PermissibilityCallback(BaseCallback):
+    """Fits E once for every vectorised environment step, at the end of each rollout, then validates it.
+
+    A guided model installs one by itself. To change how E is trained, override :meth:`fit` or :meth:`validate` and
+    pass an instance to ``learn(callback=...)``: it takes the place of the default.
+    """
+
+    model: ActionPermissibilityMixin
+
+    def __init__(self, verbose: int = 0):
+        super().__init__(verbose)
+        self._steps = 0
+        self._seen: tuple[int, ...] = (0, 0)
+        self._warned = False
+
+    @property
+    def knowledge(self) -> KnowledgeBuffer:
+        """K, which lives in the model's replay buffer."""
+        return cast(KnowledgeMixin, self.model.replay_buffer).knowledge
+
+    def _on_rollout_start(self) -> None:
+        self._steps = 0
+        self._seen = tuple(self.knowledge.seen)
+
+    def _on_step(self) -> bool:
+        self._steps += 1
+        return True
+
+    def _on_rollout_end(self) -> None:
+        # The transitions of this rollout are in K only now: `_on_step` runs before they are stored.
+        knowledge = self.knowledge
+        new = np.subtract(knowledge.seen, self._seen)
+        self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
+        if min(knowledge.counts("train")) >= self.model.min_per_class:
+            for _ in range(self._steps):
+                self.fit()
+        elif not self._warned and len(knowledge) >= CONSTANT_LABELS_WARNING:
+            self._warn_of_constant_labels(knowledge.counts("train"))
+        if self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
+            self.validate()
+
+    def fit(self) -> None:
+        """One pass over a balanced D_E of ``dataset_size`` examples."""
+        model = self.model
+        loss = model.predictor.fit(self.knowledge.sample(model.dataset_size, env=model.get_vec_normalize_env()))
+        self.logger.record_mean("sap/predictor_loss", loss)
+
+    def validate(self) -> None:
+        """Measures E on ``validation_size`` examples it was never trained on; the α gate follows the result."""
+        model = self.model
+        sample = self.knowledge.sample(model.validation_size, "validation", model.get_vec_normalize_env())
+        non_permissible, permissible = model.predictor.recall(sample)
+        model.validation_accuracy = (non_permissible + permissible) / 2
+        self.logger.record("sap/validation_accuracy", model.validation_accuracy)
+        self.logger.record("sap/validation_accuracy_permissible", permissible)
+        self.logger.record("sap/validation_accuracy_non_permissible", non_permissible)
+        self.logger.record("sap/alpha", model.current_alpha)
+
+    def _warn_of_constant_labels(self, counts: tuple[int, int]) -> None:
+        if min(counts) > 0:
+            return
+        self._warned = True
+        label = "permissible" if counts[NON_PERMISSIBLE] == 0 else "non-permissible"
+        warnings.warn(
+            f"The AP function labelled all of the first {sum(counts)} training examples {label}: from constant labels "
+            "nothing can be learned, and the run equals one without guidance. Check the AP function.",
+            stacklevel=2,
+        )
+
+
+def contains_permissibility_callback(callback: object) -> bool:
+    """Whether the user's callbacks, however nested, bring a :class:`PermissibilityCallback` of their own."""
+    if isinstance(callback, PermissibilityCallback):
+        return True
+    if isinstance(callback, list):
+        return any(map(contains_permissibility_callback, callback))
+    if isinstance(callback, CallbackList):
+        return contains_permissibility_callback(callback.callbacks)
+    return isinstance(callback, EventCallback) and contains_permissibility_callback(callback.callback)

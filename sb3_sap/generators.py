@@ -1,0 +1,15 @@
+"""Random generators of our own, so that guidance never shifts the generators that SB3 draws from."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+Stream = Literal["exploration", "knowledge", "predictor"]
+_STREAMS: tuple[Stream, ...] = ("exploration", "knowledge", "predictor")
+
+
+def make_rng(seed: int | None, stream: Stream) -> np.random.Generator:
+    """A generator for one purpose: the same seed gives the same draws, and different purposes different ones."""
+    return np.random.default_rng(None if seed is None else [seed, _STREAMS.index(stream)])

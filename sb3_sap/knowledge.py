@@ -1,0 +1,155 @@
+"""The knowledge buffer K of labelled actions (section 4.2)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sap.generators import make_rng
+from sb3_sap.permissibility import FloatArray, Observations
+
+NON_PERMISSIBLE, PERMISSIBLE = 0, 1
+CLASSES = (NON_PERMISSIBLE, PERMISSIBLE)
+Part = Literal["train", "validation"]
+
+
+class LabelledActions(NamedTuple):
+    """A balanced sample of K: n rows, half of them permissible."""
+
+    observations: Observations  # (n, *obs_shape)
+    actions: np.ndarray[Any, Any]  # (n, action_dim), scaled to [-1, 1]
+    labels: FloatArray  # (n,) 1 where permissible, else 0
+
+
+class ClassSlots:
+    """Which slots of a full or filling store belong to which class, oldest first.
+
+    When the store is full, a new tuple replaces the oldest of its class; if there is none, the oldest of the
+    other class, which is then the larger one.
+
+    :param capacity: number of slots
+    """
+
+    def __init__(self, capacity: int):
+        self.capacity = capacity
+        self.counts = [0, 0]
+        self._slots = np.zeros((2, capacity), dtype=np.int64)
+        self._oldest = [0, 0]
+
+    def __len__(self) -> int:
+        return sum(self.counts)
+
+    def slots(self, label: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """The slots that hold a tuple of class ``label``, in no promised order."""
+        return self._slots[label, : self.counts[label]]
+
+    def claim(self, label: int) -> int:
+        """The slot for a new tuple of class ``label``."""
+        if len(self) < self.capacity:
+            return self._append(label, len(self))
+        if self.counts[label] == 0:
+            return self._append(label, self._remove_oldest(1 - label))
+        position = self._oldest[label]
+        self._oldest[label] = (position + 1) % self.counts[label]
+        return int(self._slots[label, position])
+
+    def _append(self, label: int, slot: int) -> int:
+        # Only classes that have never wrapped grow, so the newest is also the last.
+        self._slots[label, self.counts[label]] = slot
+        self.counts[label] += 1
+        return slot
+
+    def _remove_oldest(self, label: int) -> int:
+        in_age_order = np.roll(self.slots(label), -self._oldest[label])
+        self.counts[label] -= 1
+        self._slots[label, : self.counts[label]] = in_age_order[1:]
+        self._oldest[label] = 0
+        return int(in_age_order[0])
+
+
+class KnowledgeBuffer:
+    """K: a finite store of (s, a, l(a)), split into training and validation examples (sections 4.2 and 5.1).
+
+    Observations are kept raw, as SB3's replay buffer keeps them, and normalised when sampled.
+
+    :param observation_space: of the environment
+    :param action_dim: length of one stored action
+    :param size: capacity; the paper's is 10,000
+    :param validation_fraction: share kept for validation; the paper's 9:1 is 0.1
+    :param seed: of the generator that splits and samples
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_dim: int,
+        size: int = 10_000,
+        validation_fraction: float = 0.1,
+        seed: int | None = None,
+    ):
+        if not 0 < validation_fraction < 1:
+            raise ValueError(f"`validation_fraction` must lie between 0 and 1, but is {validation_fraction}.")
+        n_validation = round(size * validation_fraction)
+        if min(n_validation, size - n_validation) < 2:
+            raise ValueError(
+                f"`knowledge_buffer_size` = {size} with `validation_fraction` = {validation_fraction} leaves no room "
+                "for both classes in each part: both the training and the validation part need at least 2 places."
+            )
+        self.size = size
+        self.validation_fraction = validation_fraction
+        self.seed(seed)
+        self.seen = [0, 0]  # (non-permissible, permissible) tuples ever added
+        self.parts = {"train": ClassSlots(size - n_validation), "validation": ClassSlots(n_validation)}
+        # The validation part lies behind the training part in the same arrays.
+        self._offset = {"train": 0, "validation": size - n_validation}
+        self._keyed = isinstance(observation_space, spaces.Dict)
+        keyed_spaces = (
+            observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+        )
+        self.observations = {k: np.zeros((size, *(s.shape or ())), s.dtype) for k, s in keyed_spaces.items()}
+        self.actions = np.zeros((size, action_dim), dtype=np.float32)
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts.values())
+
+    def seed(self, seed: int | None) -> None:
+        """Restarts the generator that splits and samples."""
+        self.rng = make_rng(seed, "knowledge")
+
+    def counts(self, part: Part) -> tuple[int, int]:
+        """Number of (non-permissible, permissible) tuples in a part."""
+        non_permissible, permissible = self.parts[part].counts
+        return non_permissible, permissible
+
+    def add(self, obs: Observations, actions: np.ndarray[Any, Any], labels: np.ndarray[Any, Any]) -> None:
+        """Adds n labelled actions.
+
+        :param obs: (n, *obs_shape), raw
+        :param actions: (n, action_dim), scaled
+        :param labels: (n,) bool
+        """
+        keyed = obs if isinstance(obs, dict) else {"": obs}
+        for i, label in enumerate(labels):
+            part: Part = "validation" if self.rng.random() < self.validation_fraction else "train"
+            slot = self._offset[part] + self.parts[part].claim(int(label))
+            for key, store in self.observations.items():
+                store[slot] = keyed[key][i]
+            self.actions[slot] = actions[i]
+            self.seen[int(label)] += 1
+
+    def sample(self, n: int, part: Part = "train", env: VecNormalize | None = None) -> LabelledActions:
+        """Draws D_E, balanced and stratified: n // 2 tuples of each class, with replacement, in random order.
+
+        :param env: normalises the observations, if given
+        """
+        chosen = [self.rng.choice(self.parts[part].slots(label), n // 2) for label in CLASSES]
+        slots = self._offset[part] + np.concatenate(chosen)
+        labels = np.repeat(np.array(CLASSES, dtype=np.float32), n // 2)
+        order = self.rng.permutation(len(slots))
+        slots, labels = slots[order], labels[order]
+        rows = {key: store[slots] for key, store in self.observations.items()}
+        obs: Observations = rows if self._keyed else rows[""]
+        return LabelledActions(obs if env is None else env.normalize_obs(obs), self.actions[slots], labels)

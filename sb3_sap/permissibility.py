@@ -1,0 +1,133 @@
+"""The AP function f(s, a | s') of section 4.1: the user's knowledge of which executed actions were mistakes."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, TypeAlias, TypeVar
+
+import gymnasium as gym
+import numpy as np
+
+#: A batch of observations, (n, *obs_shape), or one such array per key of a ``Dict`` space.
+Observations: TypeAlias = "np.ndarray[Any, Any] | dict[str, np.ndarray[Any, Any]]"
+BoolArray: TypeAlias = "np.ndarray[Any, np.dtype[np.bool_]]"
+FloatArray: TypeAlias = "np.ndarray[Any, np.dtype[np.floating[Any]]]"
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class APFunction(Protocol):
+    """Labels a batch of executed actions, Definition 3.
+
+    Its word against an action must be certain: an action labelled False can never be part of an optimal
+    solution. An action labelled True is merely not known to be bad.
+
+    :param obs: s, raw (never normalised) observations, (n, *obs_shape)
+    :param actions: a, in the units of the environment's action space, (n, *action_shape)
+    :param next_obs: s', the true next observations (never those after an automatic reset), (n, *obs_shape)
+    :return: (n,) bool, True where the action was permissible
+    """
+
+    def __call__(self, obs: Observations, actions: np.ndarray[Any, Any], next_obs: Observations, /) -> BoolArray: ...
+
+
+class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
+    """Puts the label of each executed action into ``info["permissible"]``.
+
+    :param env: the environment to wrap
+    :param permissible: f(s, a | s') of one step: ``permissible(obs, action, next_obs) -> bool``
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], permissible: Callable[[Any, Any, Any], bool]):
+        super().__init__(env)
+        if not callable(permissible):
+            raise TypeError(
+                "`permissible` must be a function (obs, action, next_obs) -> bool of one step, "
+                f"but is {permissible!r}: pass the function itself."
+            )
+        self.permissible = permissible
+        self._obs: Any = None
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(**kwargs)
+        self._obs = _copy(obs)
+        return obs, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        next_obs, reward, terminated, truncated, info = self.env.step(action)
+        info = {**info, "permissible": self.permissible(self._obs, action, next_obs)}
+        self._obs = _copy(next_obs)
+        return next_obs, reward, terminated, truncated, info
+
+
+def _copy(obs: Any) -> Any:
+    # An environment may reuse its observation array; the label needs the one from before the step.
+    return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
+
+
+def resolve(function: F | str, argument: str) -> F:
+    """Returns ``function``, importing it first when it is a dotted name such as ``"package.module.function"``.
+
+    :param argument: the name of the constructor argument, for the error message
+    """
+    if callable(function):
+        return function
+    if not isinstance(function, str) or "." not in function:
+        raise TypeError(
+            f"`{argument}` must be a function or its dotted name 'package.module.function', but is {function!r}."
+        )
+    module, _, name = function.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"`{argument}`: {function!r} cannot be imported ({error}): give 'package.module.function' "
+            "of a module that is on the Python path."
+        ) from error
+    if not callable(found):
+        raise TypeError(f"`{argument}`: {function!r} names a {type(found).__name__}, but must name a function.")
+    return found  # type: ignore[no-any-return]
+
+
+def labels_from_function(
+    ap_function: APFunction, obs: Observations, actions: np.ndarray[Any, Any], next_obs: Observations
+) -> BoolArray:
+    """Labels a batch with the user's AP function and checks what comes back.
+
+    :return: (n,) bool
+    """
+    name = getattr(ap_function, "__name__", repr(ap_function))
+    n = len(actions)
+    try:
+        labels = np.asarray(ap_function(obs, actions, next_obs))
+    except Exception as error:
+        raise RuntimeError(
+            f"`ap_function` {name} raised {type(error).__name__}: {error}. It is called with batches "
+            f"(obs, actions, next_obs) of n = {n} rows; here the actions have shape {actions.shape}."
+        ) from error
+    if labels.dtype != np.bool_:
+        what = "NaN" if labels.dtype.kind == "f" and np.isnan(labels).any() else f"values of type {labels.dtype}"
+        raise TypeError(f"`ap_function` {name} returned {what}, but must return bool: True where permissible.")
+    if labels.shape != (n,):
+        raise ValueError(
+            f"`ap_function` {name} returned an array of shape {labels.shape} for {n} actions, but must return "
+            f"shape ({n},): one label for each row of the batch."
+        )
+    return labels
+
+
+def labels_from_infos(infos: list[dict[str, Any]]) -> BoolArray:
+    """Collects the labels that environments or :class:`ActionPermissibility` left in ``info["permissible"]``.
+
+    :param infos: one ``info`` of each environment
+    :return: (n_envs,) bool
+    """
+    for info in infos:
+        if "permissible" not in info:
+            raise ValueError(
+                'There is no AP function: the environment puts no "permissible" into `info`. Pass `ap_function=` '
+                "to the algorithm, or wrap the environment in `ActionPermissibility(env, function)`."
+            )
+        if not isinstance(info["permissible"], (bool, np.bool_)):
+            raise TypeError(f'`info["permissible"]` must be a bool, but is {info["permissible"]!r}.')
+    return np.array([info["permissible"] for info in infos], dtype=bool)

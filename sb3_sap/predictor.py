@@ -1,0 +1,137 @@
+"""The AP predictor E(s, a): a binary classifier that foresees permissibility (section 4.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, create_mlp
+from stable_baselines3.common.utils import obs_as_tensor
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_sap.knowledge import LabelledActions
+
+
+class PermissibilityPredictor(BaseModel):
+    """E(s, a | θ_E): the logit that action a is permissible in state s.
+
+    It sees observations as the policy sees them and actions scaled to [-1, 1].
+
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :param net_arch: hidden layers; the paper's are 128 and 256
+    :param activation_fn: between them
+    :param learning_rate: of its optimizer
+    :param weight_decay: λ of Eq. (7)
+    :param batch_size: of one gradient step
+    :param optimizer_class: a ``torch.optim`` class or its name, such as ``"SGD"``
+    :param optimizer_kwargs: its further arguments
+    :param features_extractor_class: as in SB3's policies; E owns its extractor
+    :param features_extractor_kwargs: its arguments
+    :param normalize_images: as in SB3's policies
+    """
+
+    features_extractor: BaseFeaturesExtractor
+    n_updates: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        net_arch: tuple[int, ...] | list[int] = (128, 256),
+        activation_fn: type[nn.Module] = nn.ReLU,
+        learning_rate: float = 1e-3,
+        weight_decay: float = 1e-4,
+        batch_size: int = 128,
+        optimizer_class: type[th.optim.Optimizer] | str = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+    ):
+        if isinstance(optimizer_class, str):
+            found = getattr(th.optim, optimizer_class, None)
+            if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
+                raise ValueError(
+                    f"`optimizer_class` = {optimizer_class!r} names no optimizer of torch.optim, such as 'Adam'."
+                )
+            optimizer_class = found
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+        self.batch_size = batch_size
+        self.features_extractor = self.make_features_extractor()
+        n_inputs = self.features_extractor.features_dim + get_action_dim(action_space)
+        self.head = nn.Sequential(*create_mlp(n_inputs, 1, list(net_arch), activation_fn))
+        # Buffers are saved with the weights: a loaded E knows whether it was ever fitted.
+        self.register_buffer("n_updates", th.zeros((), dtype=th.long))
+        # The gradient of the L2 term λ/2 ‖θ_E‖² is λ θ_E, which torch.optim calls weight decay.       # Eq. (7)
+        self.optimizer = optimizer_class(
+            self.parameters(),
+            lr=learning_rate,  # type: ignore[call-arg]
+            weight_decay=weight_decay,
+            **self.optimizer_kwargs,
+        )
+
+    @property
+    def fitted(self) -> bool:
+        """Whether E has seen any example; Algorithm 1 does not consult it before."""
+        return bool(self.n_updates)
+
+    def features(self, obs: Any) -> th.Tensor:
+        """(n, features_dim) features of n observation tensors."""
+        return self.extract_features(obs, self.features_extractor)
+
+    def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """(n,) logits; above zero means permissible."""
+        return self.head(th.cat([features, actions], dim=1)).squeeze(1)  # type: ignore[no-any-return]
+
+    def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
+        """(n,) logits of n observations and (n, action_dim) scaled actions."""
+        return self.logits(self.features(obs), actions)
+
+    def loss(self, obs: Any, actions: th.Tensor, labels: th.Tensor) -> th.Tensor:
+        """Binary cross-entropy of (n,) labels in {0, 1}; the optimizer adds the L2 term."""
+        return F.binary_cross_entropy_with_logits(self(obs, actions), labels)  # Eq. (7)
+
+    def fit(self, dataset: LabelledActions) -> float:
+        """One pass of mini-batch gradient descent over D_E, whose rows come in random order.
+
+        :return: mean loss over the mini-batches
+        """
+        obs, actions, labels = self._to_tensors(dataset)
+        losses = []
+        for start in range(0, len(labels), self.batch_size):
+            batch = slice(start, start + self.batch_size)
+            obs_batch = {key: value[batch] for key, value in obs.items()} if isinstance(obs, dict) else obs[batch]
+            loss = self.loss(obs_batch, actions[batch], labels[batch])
+            self.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+            losses.append(loss.item())
+        self.n_updates += len(losses)
+        return float(np.mean(losses))
+
+    @th.no_grad()
+    def recall(self, dataset: LabelledActions) -> tuple[float, float]:
+        """Share of each class that E gets right, (non-permissible, permissible): their mean is balanced accuracy."""
+        obs, actions, labels = self._to_tensors(dataset)
+        correct = ((self(obs, actions) > 0) == (labels > 0.5)).cpu().numpy()
+        permissible = dataset.labels > 0.5
+        return float(correct[~permissible].mean()), float(correct[permissible].mean())
+
+    def _to_tensors(self, dataset: LabelledActions) -> tuple[Any, th.Tensor, th.Tensor]:
+        obs: Any = obs_as_tensor(dataset.observations, self.device)
+        actions, labels = (th.as_tensor(array, device=self.device) for array in dataset[1:])
+        return obs, actions, labels

@@ -1,0 +1,134 @@
+"""Settings of the paper that SB3's constructors lack, and conveniences shared by every algorithm here."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, Self, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+
+#: Training steps of the paper's main experiment (section 5.2).
+PAPER_STEPS = 15_000
+NOISES: dict[str, Callable[..., ActionNoise]] = {
+    "normal": NormalActionNoise,
+    "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
+}
+
+
+class SettingsMixin(OffPolicyAlgorithm):
+    """Goes before an SB3 off-policy algorithm in the bases of a class.
+
+    :param actor_learning_rate: of the actor alone, a number or an SB3 schedule; the paper's actor learns ten times
+        slower than its critic (section 5.1). ``None``: ``learning_rate``
+    :param action_noise: besides an SB3 ``ActionNoise``, its description as YAML can write it:
+        ``{"type": "normal", "sigma": 0.1}`` or ``{"type": "ornstein-uhlenbeck", "sigma": 0.3, "theta": 0.6, "dt": 1}``
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        env: Any,
+        *args: Any,
+        actor_learning_rate: float | Schedule | None = None,
+        **kwargs: Any,
+    ):
+        self.actor_learning_rate = actor_learning_rate
+        if env is not None:
+            env = maybe_make_env(env, kwargs.get("verbose", 0))
+            check_action_space(type(self).__name__, env.action_space)
+        # SB3 writes into the dictionary that it is given.
+        kwargs["policy_kwargs"] = dict(kwargs.get("policy_kwargs") or {})
+        super().__init__(policy, env, *args, **kwargs)
+
+    def __init_subclass__(cls, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        # The constructors here pass *args and **kwargs on; editors and API pages show the whole list.
+        cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
+
+    def _setup_model(self) -> None:
+        action_noise: Any = self.action_noise
+        if isinstance(action_noise, Mapping):
+            self.action_noise = make_action_noise(action_noise, self.action_space)
+        super()._setup_model()
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        super()._update_learning_rate(optimizers)
+        if self.actor_learning_rate is None:
+            return
+        rate = FloatSchedule(self.actor_learning_rate)(self._current_progress_remaining)
+        update_learning_rate(cast(Any, self.actor).optimizer, rate)
+        self.logger.record("train/actor_learning_rate", rate)
+
+    def learn(
+        self,
+        total_timesteps: int = PAPER_STEPS,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """SB3's ``learn``; without arguments it runs the paper's 15,000 steps."""
+        return super().learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name or type(self).__name__,
+            reset_num_timesteps,
+            progress_bar,
+        )
+
+
+def check_action_space(algorithm: str, space: spaces.Space[Any]) -> None:
+    """Refuses, in one sentence, an action space that a continuous-control algorithm cannot use."""
+    if not isinstance(space, spaces.Box):
+        raise ValueError(
+            f"{algorithm} needs an `env` with a continuous (Box) action space, but this one's is {space}: choose an "
+            "algorithm for that space."
+        )
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise ValueError(
+            f"{algorithm} needs an `env` whose actions are bounded, but this one's action space is {space}: wrap it in "
+            "gymnasium.wrappers.RescaleAction or set finite bounds."
+        )
+
+
+def make_action_noise(description: Mapping[str, Any], action_space: spaces.Space[Any]) -> ActionNoise:
+    """Builds the noise that a mapping describes, with the dimension of the action space."""
+    settings = dict(description)
+    kind = settings.pop("type", None)
+    if kind not in NOISES:
+        raise ValueError(f"`action_noise` has type {kind!r}, but must be one of {', '.join(map(repr, NOISES))}.")
+    if "sigma" not in settings:
+        raise ValueError("`action_noise` needs 'sigma', the scale of the noise in scaled actions (-1 to 1).")
+    ones = np.ones(action_space.shape or ())
+    mean = settings.pop("mean", 0.0) * ones
+    try:
+        return NOISES[kind](mean, settings.pop("sigma") * ones, **settings)
+    except TypeError as error:
+        raise ValueError(f"`action_noise` of type {kind!r}: {error}.") from error
+
+
+def merged_signature(cls: type) -> inspect.Signature:
+    """The parameters of every ``__init__`` along the MRO, as far as ``**kwargs`` carries them on."""
+    found: dict[str, inspect.Parameter] = {}
+    for base in cls.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())[1:]
+        passes_on = any(p.kind is p.VAR_KEYWORD for p in parameters)
+        for parameter in parameters:
+            # What a mixin adds is keyword-only; its other parameters are those it hands to SB3.
+            if not passes_on or parameter.kind is parameter.KEYWORD_ONLY:
+                found.setdefault(parameter.name, parameter)
+        if not passes_on:
+            break
+    return inspect.Signature(sorted(found.values(), key=lambda parameter: parameter.kind))

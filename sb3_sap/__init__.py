@@ -1,5 +1,6 @@
 """A Stable-Baselines3 extension that learns which actions are permissible while it learns to act."""
 
+from sb3_sap import envs
 from sb3_sap.algorithms import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2
 from sb3_sap.buffers import (
     KnowledgeMixin,
@@ -33,4 +34,5 @@ __all__ = [
     "PermissibilityNStepReplayBuffer",
     "PermissibilityPredictor",
     "PermissibilityReplayBuffer",
+    "envs",
 ]

@@ -11,8 +11,8 @@ from sb3_sap.exploration import ActionPermissibilityMixin
 from sb3_sap.settings import SettingsMixin
 
 #: The lane-keeping rules of section 5.1, by name: the algorithms know no environment.
-CE1 = "sb3_sap.envs.lane_keeping.constraint_ce1"
-CE2 = "sb3_sap.envs.lane_keeping.constraint_ce2"
+CE1 = "sb3_sap.envs.constraint_ce1"
+CE2 = "sb3_sap.envs.constraint_ce2"
 
 
 class DDPG(SettingsMixin, PlainDDPG):

@@ -1,0 +1,259 @@
+"""The paper's task: keep a car on the centre line by steering alone, at a default speed.
+
+State, action, reward and AP function are those of sections 4.1 and 5.1. Where the car drives is a `Simulator`'s business;
+this module knows none by name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sap.envs.tracks import Track
+
+STEERING_LOCK = 0.366519
+"""rad that the front wheels turn at steering 1, 21° (Table 1)."""
+OBSERVATION_SCALE = np.array([1.0, 1.0, 50.0, 50.0, 50.0])
+"""What one unit of the observation is: angle 1 rad, trackPos 1, speedX, speedY and speedZ 50 km/h (Table 1's order)."""
+OBSERVATION_LIMIT = np.array([math.pi, 2.0, 200.0, 200.0, 200.0])
+"""Largest magnitudes that an observation shows: rad, trackPos, km/h. What lies beyond is clipped."""
+OFF_TRACK_REWARD = -200.0
+"""Reward of the step that leaves the road or turns the car backwards (the value of the code that the paper cites)."""
+STILL_SPEED = 1.0
+"""km/h. A car whose |V_x| stays below it stands still …"""
+STILL_TIME = 5.0
+"""… and after so many seconds of that the episode ends …"""
+GRACE_TIME = 3.0
+"""… not counting the first seconds of the episode, in which a simulator may have to start the car from rest."""
+RANDOM_TRACK_POS = 0.5
+"""Random starts lie within this |trackPos| …"""
+RANDOM_ANGLE = 0.2
+"""… and within this |angle|, in rad."""
+
+Observation = NDArray[np.float32]
+Action = NDArray[np.float32]
+
+
+class CarState(NamedTuple):
+    """What the task needs to know of the car (Table 1)."""
+
+    angle: float
+    """rad, in [-pi, pi]: road heading minus yaw; positive when the car points to the right of the road.
+
+    The sign is that of TORCS' sensors: positive steering corrects a positive angle."""
+    track_pos: float
+    """2 · (distance to the left of the centre line) / width: 0 on the axis, 1 at the left edge, -1 at the right."""
+    speed_x: float
+    """km/h, along the car's longitudinal axis."""
+    speed_y: float
+    """km/h, along its transverse axis, positive to the left."""
+    speed_z: float
+    """km/h, along its vertical axis."""
+    distance: float
+    """m along the centre line from the start line, in [0, length)."""
+
+
+class Simulator(Protocol):
+    """Where the car drives: one car on one track, held at its default speed."""
+
+    track: Track
+    """Plan geometry, for the viewer."""
+    length: float
+    """m, one lap along the centre line."""
+    control_step: float
+    """s, between two actions."""
+
+    def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
+        """Put the car on the road, as `CarState` says it, and return where it stands."""
+        ...
+
+    def step(self, steering: float) -> CarState:
+        """Drive one control step with the steering (in [-1, 1], positive to the left) held."""
+        ...
+
+    def close(self) -> None:
+        """Release what the simulator holds."""
+        ...
+
+
+def reward(state: CarState) -> float:
+    """Return the reward of reaching ``state``, in km/h; at best V_x, on the axis and aligned with it.
+
+    The bars on sin θ and δ are our reading: without them one edge of the road would pay more than the centre.
+    """
+    # δ is trackPos, θ the angle, V_x in km/h
+    return state.speed_x * (math.cos(state.angle) - abs(math.sin(state.angle)) - abs(state.track_pos))  # Eq. (5)
+
+
+def ap_function(obs: NDArray[Any], actions: NDArray[Any], next_obs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Tell which actions were permissible: those that did not take the car further from the axis.
+
+    :param obs: observations, as the environment returns them, shape (n, 5)
+    :param actions: the actions executed there, shape (n, 1); Eq. (6) judges by the states alone
+    :param next_obs: the observations that followed, shape (n, 5)
+    :return: True where permissible, shape (n,)
+    """
+    del actions
+    moved_away: NDArray[np.bool_] = np.abs(next_obs[:, 1]) - np.abs(obs[:, 1]) > 0  # Eq. (6)
+    return ~moved_away
+
+
+def score(total_reward: float, length: float, control_step: float) -> float:
+    """Return the normalised score S of one lap: 1 is a perfect lap, at any speed, on any track.
+
+    Each step earns at most V_x, and the V_x·Δt of a lap add up to its length, so its total is at most 3.6·L/Δt.
+
+    :param total_reward: sum of the rewards of the lap
+    :param length: L, m
+    :param control_step: Δt, s
+    """
+    return total_reward / (3.6 * length / control_step)
+
+
+class LaneKeepingEnv(gym.Env[Observation, Action]):
+    """Keep the car in its lane (Table 1, Eq. 5, Eq. 6).
+
+    Observation: angle, trackPos, speedX, speedY, speedZ in units of `OBSERVATION_SCALE`, float32, shape (5,).
+    Action: steering in [-1, 1], shape (1,), times `STEERING_LOCK`; positive turns left; what lies outside is clipped.
+    Reward: Eq. (5) of the state reached.
+
+    An episode *terminates* when the car leaves the road (|trackPos| > 1) or faces backwards (cos θ < 0), both with
+    `OFF_TRACK_REWARD` in place of Eq. (5), and when it stands still, with the reward unchanged. It is *truncated* when
+    the laps are completed, counted from where it started.
+
+    ``info`` holds the raw angle (rad), track_pos, speed_x, speed_y, speed_z (km/h) and distance (m); off_track;
+    ``covered``, the fraction driven of the laps (of one lap, beyond 1 too, if ``laps=None``); lap_done: they are
+    covered; and after a step ``permissible``, Eq. (6) on the raw values.
+
+    ``reset(options={"distance": m, "track_pos": …, "angle": rad})`` chooses the start; what is not given is as usual.
+
+    :param simulator: what moves the car
+    :param laps: laps to drive, or None to drive on as the paper trains
+    :param random_start: start anywhere on the track, somewhat off the axis, instead of at the line, centred, aligned
+    :param render_mode: None, "rgb_array" or "human"
+    :raise ValueError: for laps or a render mode that cannot be, a start that does not exist, a steering of NaN
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # type: ignore[misc]
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        *,
+        laps: int | None = 1,
+        random_start: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        if laps is not None and (isinstance(laps, bool) or not isinstance(laps, (int, np.integer)) or laps < 1):
+            raise ValueError(f"laps must be a positive whole number, or None to drive on, got {laps!r}.")
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode!r}.")
+        self.simulator = simulator
+        self.laps = laps
+        self.random_start = random_start
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1 / simulator.control_step))}  # type: ignore[misc]
+        limit = (OBSERVATION_LIMIT / OBSERVATION_SCALE).astype(np.float32)
+        self.observation_space = gym.spaces.Box(-limit, limit, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
+        self._limit = limit
+        self._viewer: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Place the car and return the first observation, shape (5,), and ``info`` without "permissible"."""
+        super().reset(seed=seed)
+        start = {"distance": 0.0, "track_pos": 0.0, "angle": 0.0}
+        if self.random_start:
+            start["distance"] = self.np_random.uniform(0.0, self.simulator.length)
+            start["track_pos"] = self.np_random.uniform(-RANDOM_TRACK_POS, RANDOM_TRACK_POS)
+            start["angle"] = self.np_random.uniform(-RANDOM_ANGLE, RANDOM_ANGLE)
+        start.update(_checked_start(options or {}, self.simulator.length))
+        self._state = self.simulator.reset(**start)
+        self._steering = 0.0
+        self._progress = 0.0  # m
+        self._steps = 0
+        self._still_steps = 0
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), self._info()
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Steer for one control step and return observation (5,), reward, terminated, truncated and ``info``."""
+        steering = float(np.asarray(action).item())
+        if math.isnan(steering):
+            raise ValueError("action must be a steering in [-1, 1], got NaN.")
+        before, dt = self._state, self.simulator.control_step
+        self._steering = min(max(steering, -1.0), 1.0)
+        self._state = state = self.simulator.step(self._steering)
+        half = self.simulator.length / 2
+        self._progress += (state.distance - before.distance + half) % (2 * half) - half  # across the start line too
+        self._steps += 1
+        moving = abs(state.speed_x) >= STILL_SPEED or self._steps * dt <= GRACE_TIME
+        self._still_steps = 0 if moving else self._still_steps + 1
+
+        info = self._info()
+        info["permissible"] = not abs(state.track_pos) - abs(before.track_pos) > 0  # Eq. (6)
+        lost = info["off_track"] or math.cos(state.angle) < 0
+        stands = self._still_steps >= round(STILL_TIME / dt)
+        finished = self.laps is not None and info["lap_done"]
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), OFF_TRACK_REWARD if lost else reward(state), lost or stands, finished, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw the car on its track: an image (height, width, 3) for "rgb_array", a window for "human"."""
+        if self.render_mode is None:
+            gym.logger.warn("render() draws nothing: the environment was made without a render_mode.")
+            return None
+        if self._viewer is None:
+            from sb3_sap.envs.viewer import Viewer
+
+            self._viewer = Viewer(self.simulator.track, window=self.render_mode == "human")
+        image: NDArray[np.uint8] = self._viewer.draw(self._state, self._steering)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one, and the simulator."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+        self.simulator.close()
+
+    def _observation(self) -> Observation:
+        raw = np.array(self._state[:5]) / OBSERVATION_SCALE
+        return np.clip(raw.astype(np.float32), -self._limit, self._limit)
+
+    def _info(self) -> dict[str, Any]:
+        covered = max(self._progress / ((self.laps or 1) * self.simulator.length), 0.0)
+        if self.laps is not None:
+            covered = min(covered, 1.0)
+        off_track = abs(self._state.track_pos) > 1
+        lap_done = covered >= 1 and not off_track
+        return {**self._state._asdict(), "covered": covered, "off_track": off_track, "lap_done": lap_done}
+
+
+def _checked_start(options: Mapping[str, Any], length: float) -> dict[str, float]:
+    bounds = {"distance": (0.0, length, "m"), "track_pos": (-1.0, 1.0, ""), "angle": (-math.pi / 2, math.pi / 2, "rad")}
+    start = {}
+    for name, value in options.items():
+        if name not in bounds:
+            near = difflib.get_close_matches(str(name), bounds, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else "."
+            raise ValueError(f"options of reset() may hold distance, track_pos and angle, got {name!r}{hint}")
+        low, high, unit = bounds[name]
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = math.nan
+        if not low <= number <= high:
+            raise ValueError(f"options[{name!r}] must lie in [{low:g}, {high:g}] {unit}".rstrip() + f", got {value!r}.")
+        start[name] = number
+    return start

@@ -1,7 +1,7 @@
 """The paper's task: keep a car on the centre line by steering alone, at a default speed.
 
-State, action, reward and AP function are those of sections 4.1 and 5.1. Where the car drives is a `Simulator`'s business;
-this module knows none by name.
+State, action, reward and AP function are those of sections 4.1 and 5.1. Where the car drives is a `Simulator`'s
+business; this module knows none by name.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
             self.render()
         return self._observation(), OFF_TRACK_REWARD if lost else reward(state), lost or stands, finished, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the car on its track: an image (height, width, 3) for "rgb_array", a window for "human"."""
         if self.render_mode is None:
             gym.logger.warn("render() draws nothing: the environment was made without a render_mode.")
@@ -228,8 +228,9 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         self.simulator.close()
 
     def _observation(self) -> Observation:
-        raw = np.array(self._state[:5]) / OBSERVATION_SCALE
-        return np.clip(raw.astype(np.float32), -self._limit, self._limit)
+        scaled = (np.array(self._state[:5]) / OBSERVATION_SCALE).astype(np.float32)
+        clipped: Observation = np.minimum(np.maximum(scaled, -self._limit), self._limit)
+        return clipped
 
     def _info(self) -> dict[str, Any]:
         covered = max(self._progress / ((self.laps or 1) * self.simulator.length), 0.0)

@@ -1,0 +1,166 @@
+"""Pictures of the car on its track, through highway-env's graphics.
+
+The car is drawn from its `CarState` on the track's plan geometry alone, so any simulator can be looked at. Only the
+road near the car is drawn; a small map shows where on the track that is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pygame
+from highway_env.road.graphics import LaneGraphics, WorldSurface
+from highway_env.road.lane import AbstractLane
+from highway_env.vehicle.dynamics import BicycleVehicle
+from highway_env.vehicle.graphics import VehicleGraphics
+from numpy.typing import NDArray
+
+from sb3_sap.envs.lane_keeping import STEERING_LOCK, CarState
+from sb3_sap.envs.tracks import Track
+
+SIZE = (600, 400)
+"""Width and height of the picture, in pixels."""
+OVERSAMPLING = 2
+"""The world is drawn so many times larger and scaled down, for smooth edges."""
+SCALING = 9.0
+"""Pixels per metre of the world."""
+ROAD_STEP = 1.0
+"""m between two points of the road's edges."""
+DASH_EVERY = 9.0
+"""m from one dash of the centre line to the next; each is as long as highway-env's stripes."""
+MAP_SIZE = 96
+"""Longest side of the map, in pixels."""
+MAP_STEP = 10.0
+"""m between two points of the map's line."""
+MARGIN = 12
+"""Pixels around the map and the panel's text."""
+PANEL_HEIGHT = 34
+"""Pixels."""
+
+GRASS, ASPHALT, LINE = (112, 150, 84), (138, 140, 145), (245, 245, 240)
+CAR, PANEL, ACCENT = (58, 140, 230), (28, 32, 38), (255, 190, 60)
+
+
+class Viewer:
+    """Draw states of the car on one track.
+
+    :param track: its plan geometry
+    :param window: show each picture in a window, too
+    """
+
+    def __init__(self, track: Track, window: bool = False) -> None:
+        self.track = track
+        self._lane = _UnrolledTrack(track)
+        pygame.font.init()
+        self._font = pygame.font.Font(None, 22)
+        world_size = (SIZE[0] * OVERSAMPLING, SIZE[1] * OVERSAMPLING)
+        self._world = WorldSurface(world_size, 0, pygame.Surface(world_size))
+        self._world.scaling = SCALING * OVERSAMPLING
+        self._picture = pygame.Surface(SIZE)
+        self._map = _Map(track)
+        self._window: pygame.Surface | None = None
+        if window:
+            pygame.display.init()
+            self._window = pygame.display.set_mode(SIZE)
+            pygame.display.set_caption(f"LaneKeeping · {track.name}")
+
+    def draw(self, state: CarState, steering: float) -> NDArray[np.uint8]:
+        """Return the picture of a state, shape (height, width, 3), north up and the car in the middle.
+
+        :param steering: the last action, in [-1, 1], positive to the left
+        """
+        x, y, road_heading = self.track.position(state.distance, state.track_pos * self.track.width / 2)
+        self._world.move_display_window_to(np.array([x, y]))
+        self._draw_road(state.distance)
+        self._draw_car(x, y, road_heading - state.angle, steering)
+        upright = pygame.transform.flip(self._world, False, True)  # pixels count downwards, the plan's y upwards
+        pygame.transform.smoothscale(upright, SIZE, self._picture)
+        self._map.draw(self._picture, state.distance)
+        self._draw_panel(state, steering)
+        if self._window is not None:
+            pygame.event.pump()
+            self._window.blit(self._picture, (0, 0))
+            pygame.display.flip()
+        return np.ascontiguousarray(pygame.surfarray.array3d(self._picture).swapaxes(0, 1))
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            pygame.display.quit()
+            self._window = None
+
+    def _draw_road(self, distance: float) -> None:
+        reach = math.hypot(*SIZE) / SCALING / 2 + self.track.width
+        here = distance + self.track.length * math.ceil(reach / self.track.length)  # stripes must not begin below 0
+        along = np.arange(here - reach, here + reach, ROAD_STEP)
+        half = self.track.width / 2
+        left, right = ([self._world.vec2pix(self._lane.position(s, side)) for s in along] for side in (half, -half))
+        self._world.fill(GRASS)
+        pygame.draw.polygon(self._world, ASPHALT, left + right[::-1])
+        for edge in (left, right):
+            pygame.draw.lines(self._world, LINE, False, edge, self._world.pix(LaneGraphics.STRIPE_WIDTH))
+        dashes = np.arange((here - reach) // DASH_EVERY, (here + reach) // DASH_EVERY) * DASH_EVERY
+        ends = dashes + LaneGraphics.STRIPE_LENGTH
+        LaneGraphics.draw_stripes(self._lane, self._world, dashes, ends, np.zeros_like(dashes))
+        if distance < reach or self.track.length - distance < reach:  # the start line
+            start = [self._world.vec2pix(self._lane.position(0.0, side)) for side in (half, -half)]
+            pygame.draw.lines(self._world, LINE, False, start, self._world.pix(2 * LaneGraphics.STRIPE_WIDTH))
+
+    def _draw_car(self, x: float, y: float, heading: float, steering: float) -> None:
+        # highway-env draws headings of less than 2 degrees as none: a whole turn more avoids that.
+        car = BicycleVehicle(None, (x, y), heading % math.tau + math.tau)
+        car.color = CAR
+        car.act({"steering": steering * STEERING_LOCK, "acceleration": 0.0})
+        VehicleGraphics.display(car, self._world, offscreen=True)
+
+    def _draw_panel(self, state: CarState, steering: float) -> None:
+        top = SIZE[1] - PANEL_HEIGHT
+        pygame.draw.rect(self._picture, PANEL, (0, top, SIZE[0], PANEL_HEIGHT))
+        text = (
+            f"{state.speed_x:3.0f} km/h     trackPos {state.track_pos:+.2f}     angle {math.degrees(state.angle):+.1f}°"
+            f"     {state.distance:,.0f} m"
+        )
+        self._picture.blit(self._font.render(text, True, LINE), (MARGIN, top + 10))
+        # A bar from the middle of its rail shows the steering, to the left where it steers left.
+        middle, length, height = SIZE[0] - MARGIN - 60, 60, top + PANEL_HEIGHT // 2
+        pygame.draw.line(self._picture, ASPHALT, (middle - length, height), (middle + length, height), 8)
+        pygame.draw.line(self._picture, ACCENT, (middle, height), (middle - round(steering * length), height), 8)
+        pygame.draw.line(self._picture, LINE, (middle, height - 8), (middle, height + 8), 2)
+
+
+class _UnrolledTrack(AbstractLane):  # type: ignore[misc]
+    """The whole track as one of highway-env's lanes, lap after lap, for its stripes."""
+
+    length = math.inf
+
+    def __init__(self, track: Track) -> None:
+        self.track = track
+
+    def position(self, longitudinal: float, lateral: float) -> NDArray[np.float64]:
+        return np.array(self.track.position(longitudinal, lateral)[:2])
+
+
+class _Map:
+    """The plan of the whole track in the corner of the picture, with a dot where the car is."""
+
+    def __init__(self, track: Track) -> None:
+        self.track = track
+        points = np.array([track.position(s)[:2] for s in np.arange(0.0, track.length, MAP_STEP)])
+        self._corner = points.min(axis=0)
+        extent = points.max(axis=0) - self._corner
+        self._scale = MAP_SIZE / extent.max()
+        self._size = extent * self._scale
+        self._points = [self._pixel(point) for point in points]
+
+    def draw(self, picture: pygame.Surface, distance: float) -> None:
+        width, height = self._size + 2 * MARGIN
+        shade = pygame.Surface((width, height), pygame.SRCALPHA)
+        shade.fill((*PANEL, 200))
+        pygame.draw.aalines(shade, LINE, True, self._points)
+        pygame.draw.circle(shade, ACCENT, self._pixel(np.array(self.track.position(distance)[:2])), 4)
+        picture.blit(shade, (SIZE[0] - width, 0))
+
+    def _pixel(self, point: NDArray[np.float64]) -> tuple[float, float]:
+        x, y = (point - self._corner) * self._scale
+        return float(x) + MARGIN, float(self._size[1] - y) + MARGIN

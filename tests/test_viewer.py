@@ -1,0 +1,116 @@
+"""Pictures: what is where, judged by the colours of single pixels."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import sb3_sap  # noqa: F401  # registers the environment
+from sb3_sap.envs import CarState, get_track
+from sb3_sap.envs.tracks import Segment, Track
+from sb3_sap.envs.viewer import ACCENT, ASPHALT, CAR, GRASS, SCALING, SIZE, Viewer
+
+MIDDLE = (SIZE[1] // 2, SIZE[0] // 2)
+"""Row and column."""
+
+
+@pytest.fixture(autouse=True)
+def _headless(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+
+
+def eastward(track_pos: float = 0.0, angle: float = 0.0, steering: float = 0.0) -> NDArray[np.uint8]:
+    """A car amid a long straight to the east, 12 m wide."""
+    viewer = Viewer(Track("straight", 12, [Segment.straight(1000), Segment.curve(1.0, 100)]))
+    return viewer.draw(CarState(angle, track_pos, 50, 0, 0, 500.0), steering)
+
+
+def at(picture: NDArray[np.uint8], right: float = 0.0, up: float = 0.0) -> tuple[int, ...]:
+    """Colour of the pixel so many metres from the middle."""
+    return tuple(picture[round(MIDDLE[0] - up * SCALING), round(MIDDLE[1] + right * SCALING)].tolist())
+
+
+def test_car_road_and_grass_are_in_their_places() -> None:
+    picture = eastward()
+    assert picture.shape == (SIZE[1], SIZE[0], 3)
+    assert picture.dtype == np.uint8
+    assert at(picture) == CAR
+    assert [at(picture, up=up) for up in (5, -5)] == [ASPHALT, ASPHALT]
+    assert [at(picture, up=up) for up in (7, -7)] == [GRASS, GRASS]
+
+
+def test_a_car_at_the_left_edge_has_the_road_below_it() -> None:
+    picture = eastward(track_pos=1.0)  # the car stays in the middle of the picture; driving east, left is up
+    assert at(picture) == CAR
+    assert at(picture, up=2) == GRASS
+    assert at(picture, up=-11) == ASPHALT
+
+
+def test_a_car_that_points_right_is_drawn_so() -> None:
+    picture = eastward(angle=0.8)  # to the right of east is down
+    assert [at(picture, right=1.2, up=up) for up in (-1.2, 1.2)] == [CAR, ASPHALT]
+
+
+def test_small_headings_are_drawn_too() -> None:
+    assert not np.array_equal(eastward(angle=0.03), eastward())
+
+
+def test_steering_moves_the_bar_to_its_side() -> None:
+    bars = [np.argwhere((eastward(steering=s)[-34:] == ACCENT).all(axis=2))[:, 1] for s in (1.0, -1.0)]
+    assert bars[0].max() <= bars[1].min() + 1
+
+
+def test_only_the_road_nearby_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer = Viewer(get_track("spring"))
+    asked: list[float] = []
+    position = Track.position
+
+    def spy(track: Track, distance: float, lateral: float = 0.0) -> tuple[float, float, float]:
+        asked.append(distance % track.length)
+        return position(track, distance, lateral)
+
+    monkeypatch.setattr(Track, "position", spy)
+    viewer.draw(CarState(0, 0, 50, 0, 0, 11_000.0), 0.0)
+    assert len(asked) < 500
+    assert 10_900 < min(asked) < max(asked) < 11_100
+
+
+@pytest.mark.parametrize("distance", [0.0, 6205.0])
+def test_the_road_goes_on_across_the_start_line(distance: float) -> None:
+    picture = Viewer(get_track("wheel-2")).draw(CarState(0, 0, 50, 0, 0, distance), 0.0)
+    assert [at(picture, right=right, up=3) for right in (-25, 25)] == [ASPHALT, ASPHALT]
+
+
+def test_environment_renders_what_it_drives() -> None:
+    env = gym.make("sap/LaneKeeping-v0", render_mode="rgb_array")
+    env.reset()
+    first = env.render()
+    env.step(np.array([0.5], dtype=np.float32))
+    second = env.render()
+    assert isinstance(first, np.ndarray)
+    assert first.shape == (SIZE[1], SIZE[0], 3)
+    assert not np.array_equal(first, second)
+    assert env.metadata["render_fps"] == 5
+    env.close()
+
+
+def test_a_window_opens_and_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    env = gym.make("sap/LaneKeeping-v0", render_mode="human")
+    env.reset()
+    env.step(np.zeros(1, dtype=np.float32))
+    window = pygame.display.get_surface()
+    assert window is not None
+    assert window.get_at((MIDDLE[1], MIDDLE[0]))[:3] == CAR
+    env.close()
+    assert pygame.display.get_surface() is None
+
+
+def test_rendering_without_a_mode_warns() -> None:
+    env = gym.make("sap/LaneKeeping-v0")
+    env.reset()
+    with pytest.warns(UserWarning, match="without a render_mode"):
+        assert env.unwrapped.render() is None

@@ -19,7 +19,7 @@ from sb3_sap.constraints import ConstrainedExplorationMixin
 from sb3_sap.generators import make_rng
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, FloatArray, resolve
-from sb3_sap.predictor import PermissibilityPredictor
+from sb3_sap.predictor import PermissibilityPredictor, flush_denormals
 
 #: Validation accuracy from which the actor listens with probability α (section 4.3).
 SUFFICIENT_ACCURACY = 0.7
@@ -205,6 +205,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         return action, scaled
 
     @th.no_grad()
+    @flush_denormals()
     def _guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
         """Lines 5 to 14 of Algorithm 1, for all environments at once.
 

@@ -1,0 +1,100 @@
+"""The ``sb3-sap`` command."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from sb3_sap import __version__
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs a command and returns its exit code; what the user got wrong is told in one sentence."""
+    options = parser().parse_args(arguments)
+    try:
+        options.run(options, Console())
+    except KeyboardInterrupt:
+        print("sb3-sap: interrupted; what was written so far is kept.", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, OSError) as error:
+        print(f"sb3-sap: error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    root = argparse.ArgumentParser(prog="sb3-sap", description="Learn which actions are permissible while acting.")
+    root.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = root.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_demo(commands)
+    _add_evaluate(commands)
+    return root
+
+
+def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    from sb3_sap.demo import ALGORITHMS, Run
+
+    default = Run()
+    command = commands.add_parser(
+        "demo",
+        help="train a car to keep its lane, then drive the unseen tracks",
+        description="Trains on one track, drives one lap of each of the paper's four test tracks with the actor alone, "
+        "prints a table, and leaves model.zip, training.csv, evaluation.json, learning_curve.png, predictor.png and "
+        "lap.gif in the output folder.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--algo", choices=list(ALGORITHMS), default=default.algo, help="the algorithm")
+    command.add_argument("--preset", default=default.preset, help="named settings of zoo_configs")
+    command.add_argument("--steps", type=_positive, default=default.steps, help="training steps")
+    command.add_argument("--seed", type=int, default=default.seed, help="seed of everything random")
+    command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
+    command.add_argument("--out", type=Path, default=default.out, help="output folder")
+    command.add_argument("--no-animation", dest="animation", action="store_false", help="leave out lap.gif")
+    command.set_defaults(run=_demo)
+
+
+def _demo(options: argparse.Namespace, console: Console) -> None:
+    from sb3_sap.demo import Run, demo
+
+    demo(Run(**{name: value for name, value in vars(options).items() if name != "run"}), console)
+
+
+def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    from sb3_sap.benchmark.paper import TEST_TRACKS
+
+    command = commands.add_parser(
+        "evaluate",
+        help="drive laps with a saved model",
+        description="Drives one lap of each track with the saved policy alone, prints a table and writes it as JSON. "
+        "Loading a model file runs code that it contains: load only files that you trust.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("model", type=Path, help="the .zip file of any SB3 model of the lane-keeping task")
+    command.add_argument("--tracks", nargs="+", default=list(TEST_TRACKS), metavar="TRACK", help="tracks to drive")
+    command.add_argument("--json", type=Path, help="where to write the results; evaluation.json beside the model")
+    command.set_defaults(run=_evaluate, simulator="highway")
+
+
+def _evaluate(options: argparse.Namespace, console: Console) -> None:
+    from sb3_sap.demo import drive_tracks, results_table
+    from sb3_sap.evaluation import load_policy, write_results
+
+    policy = load_policy(options.model)
+    results = drive_tracks(policy, options.tracks, options.simulator, console)
+    console.print(results_table(results))
+    write_results(options.json or options.model.parent / "evaluation.json", results)
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be 1 or more, but is {number}")
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,166 @@
+"""The main job in one command: learn on one track, drive the unseen ones, show what happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_sap import algorithms, plots
+from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS
+from sb3_sap.envs import TRACKS, score
+from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive, drive_lap, write_results
+from sb3_sap.files import atomic_path
+from sb3_sap.presets import preset
+
+#: The paper's five, by their RL Zoo names.
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
+    "ddpg": algorithms.DDPG,
+    "ddpg_ce1": algorithms.DDPGCE1,
+    "ddpg_ce2": algorithms.DDPGCE2,
+    "ddpg_ap": algorithms.DDPGAP,
+    "ddpg_ap_ce2": algorithms.DDPGAPCE2,
+}
+#: km/h, the default speed of the task.
+SPEED = 50.0
+#: Control steps shown in the animation (30 s of driving), and pictures per second: twice real time.
+ANIMATION_STEPS = 150
+ANIMATION_FPS = 10
+
+
+@dataclass
+class Run:
+    """What to train, where, and where to leave the results."""
+
+    algo: str = "ddpg_ap"
+    preset: str = "paper"
+    steps: int = 3_000
+    seed: int = 0
+    track: str = "wheel-2"
+    simulator: str = "highway"
+    out: Path = field(default_factory=lambda: Path("demo_output"))
+    animation: bool = True
+
+
+class TrainingLog(BaseCallback):
+    """Collects one row of a tidy table for every training step."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[dict[str, Any]] = []
+
+    def _on_step(self) -> bool:
+        [info], [reward] = self.locals["infos"], self.locals["rewards"]
+        self.rows.append(
+            {
+                "step": self.num_timesteps,
+                "episode": self.model._episode_num,
+                "reward": float(reward),
+                "permissible": info["permissible"],
+                "off_track": info["off_track"],
+                "track_pos": info["track_pos"],
+                "validation_accuracy": getattr(self.model, "validation_accuracy", float("nan")),
+                "alpha": getattr(self.model, "current_alpha", float("nan")),
+            }
+        )
+        return True
+
+
+def demo(run: Run, console: Console) -> list[LapResult]:
+    """Trains, drives the test tracks and leaves model, tables and pictures in ``run.out``."""
+    env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
+    settings = preset(run.preset, run.algo, run.steps)
+    model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
+    console.print(f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} ({run.preset} preset)")
+    log = TrainingLog()
+    try:
+        model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
+    finally:
+        # Ctrl-C included: what was learned so far stays.
+        with atomic_path(run.out / "model.zip") as temporary:
+            model.save(temporary)
+        training = pd.DataFrame(log.rows)
+        with atomic_path(run.out / "training.csv") as temporary:
+            training.to_csv(temporary, index=False)
+    results = drive_tracks(model, list(TEST_TRACKS), run.simulator, console)
+    write_results(run.out / "evaluation.json", results)
+    console.print(results_table(results, run.algo, run.steps))
+    draw(run, model, training)
+    if run.animation:
+        animate(model, run, console)
+    console.print(f"Model, tables and pictures are in [bold]{run.out}/[/]")
+    return results
+
+
+def drive_tracks(policy: Any, tracks: list[str], simulator: str, console: Console) -> list[LapResult]:
+    """Drives one lap of each track, showing progress."""
+    with Progress(console=console, transient=True) as progress:
+        return [drive_lap(policy, track, simulator, progress) for track in tracks]
+
+
+def results_table(results: list[LapResult], algo: str | None = None, steps: int = 3_000) -> Table:
+    """The results as the paper's Table 2 shows them, beside its own row of the same algorithm where there is one."""
+    paper = TABLE_2.get(steps, TABLE_2[3_000]).get(algo or "", {})
+    paper_steps = f"{steps if steps in TABLE_2 else 3_000:,}"
+    table = Table(title="One lap of each track, the actor alone")
+    for name in ("track", "lap done", "covered", "total reward", "score S"):
+        table.add_column(name, justify="left" if name == "track" else "right")
+    if paper:
+        table.add_column(f"paper, {paper_steps} steps: covered", justify="right", style="dim")
+        table.add_column("score S", justify="right", style="dim")
+    for result in results:
+        row = [
+            TRACKS.get(result.track, result.track),
+            "yes" if result.lap_done else "no",
+            f"{result.covered:.1%}",
+            f"{result.total_reward:,.0f}",
+            f"{result.score:.3f}",
+        ]
+        if result.track in paper:
+            lap = paper[result.track]
+            row += [f"{lap.covered:.1%}", f"{paper_score(result.track, lap.total_reward):.3f}"]
+        table.add_row(*row)
+    return table
+
+
+def paper_score(track: str, total_reward: float) -> float:
+    """S of a total of Table 2, at the control step of 0.2 s that the totals imply."""
+    from sb3_sap.envs import get_track
+
+    return score(total_reward, get_track(track).length, 0.2)
+
+
+def draw(run: Run, model: Any, training: pd.DataFrame) -> None:
+    """Draws the learning curve and, where there is a fitted predictor, what it believes."""
+    title = f"{type(model).__name__} on {TRACKS.get(run.track, run.track)}, seed {run.seed}"
+    plots.save(
+        plots.learning_curve(training, title, getattr(model, "noise_steps", None)), run.out / "learning_curve.png"
+    )
+    predictor = getattr(model, "predictor", None)
+    if predictor is not None and predictor.fitted:
+        plots.save(plots.predictor_beliefs(model, SPEED), run.out / "predictor.png")
+
+
+def animate(policy: Any, run: Run, console: Console, track: str = "g-track-3") -> None:
+    """Writes a short animation of the policy on a track that it has never seen."""
+    env = gym.make(ENVIRONMENTS[run.simulator], track=track, speed=SPEED, render_mode="rgb_array")
+    frames = []
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("animation", total=ANIMATION_STEPS)
+        for _ in drive(policy, env):
+            frames.append(Image.fromarray(env.render()).quantize(64))  # type: ignore[arg-type]
+            progress.advance(task)
+            if len(frames) == ANIMATION_STEPS:
+                break
+    env.close()
+    with atomic_path(run.out / "lap.gif") as temporary:
+        frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=1000 // ANIMATION_FPS, loop=0)

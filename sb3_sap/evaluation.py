@@ -1,0 +1,89 @@
+"""Driving laps with a policy alone: what was learned, without noise and without guidance (Table 2)."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+from rich.progress import Progress
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_sap.envs import score
+from sb3_sap.files import atomic_path
+
+#: The lane-keeping task on each simulator.
+ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0"}
+
+
+@dataclass(frozen=True)
+class LapResult:
+    """One lap, or what was driven of it."""
+
+    track: str
+    lap_done: bool
+    covered: float  # fraction of the lap
+    total_reward: float
+    score: float  # normalised: 1 is a perfect lap
+    steps: int
+
+
+def drive(policy: Any, env: gym.Env[Any, Any]) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Drives one episode deterministically.
+
+    :param policy: a model or policy with SB3's ``predict``
+    :return: (reward, info) of each step
+    """
+    obs, _ = env.reset(seed=0)
+    done = False
+    while not done:
+        action, _ = policy.predict(obs, deterministic=True)
+        obs, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        yield float(reward), info
+
+
+def drive_lap(policy: Any, track: str, simulator: str = "highway", progress: Progress | None = None) -> LapResult:
+    """Drives one lap of a track."""
+    env = gym.make(ENVIRONMENTS[simulator], track=track, laps=1)
+    task = progress.add_task(f"lap of {track}", total=1.0) if progress else None
+    rewards = []
+    info: dict[str, Any] = {}
+    for reward, info in drive(policy, env):
+        rewards.append(reward)
+        if progress and task is not None:
+            progress.update(task, completed=info["covered"])
+    driven = env.unwrapped.simulator  # type: ignore[attr-defined]
+    env.close()
+    total = sum(rewards)
+    normalised = score(total, driven.length, driven.control_step)
+    return LapResult(track, bool(info["lap_done"]), float(info["covered"]), total, normalised, len(rewards))
+
+
+def write_results(path: Path, results: list[LapResult]) -> None:
+    """Writes ``evaluation.json``: a list of the results."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps([asdict(result) for result in results], indent=2) + "\n", encoding="utf-8")
+
+
+def load_policy(path: Path) -> BasePolicy:
+    """Loads the policy alone from a model file, whichever SB3 algorithm saved it."""
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no model file {path}: give the .zip that `model.save` or the demo wrote.")
+    try:
+        data, params, _ = load_from_zip_file(path, device="cpu")
+    except (ValueError, EOFError, zipfile.BadZipFile, RuntimeError, KeyError) as error:
+        raise ValueError(f"{path} is not a whole model file ({error}): save the model again.") from error
+    if data is None or params is None or "policy" not in params:
+        raise ValueError(f"{path} holds no SB3 policy: give a file that `model.save` wrote.")
+    policy: BasePolicy = data["policy_class"](
+        data["observation_space"], data["action_space"], lambda _: 0.0, **data["policy_kwargs"]
+    )
+    policy.load_state_dict(cast(dict[str, Any], params["policy"]))
+    policy.set_training_mode(False)
+    return policy

@@ -1,0 +1,56 @@
+"""Named settings, read from ``zoo_configs``: one source of truth for constructors, commands and RL Zoo."""
+
+from __future__ import annotations
+
+import difflib
+from importlib import resources
+from typing import Any
+
+import yaml
+
+#: Keys of RL Zoo's format that tell its runner, not the algorithm's constructor, what to do.
+RUNNER_KEYS = frozenset(
+    {"n_timesteps", "policy", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "frame_stack", "callback"}
+)
+#: The paper chose t_k by the length of the run: up to so many steps, entries named ``<preset>-3k`` hold.
+SHORT_RUN = 3_000
+
+
+def algorithms() -> list[str]:
+    """The algorithms that have settings, by their RL Zoo names."""
+    folder = resources.files("sb3_sap") / "zoo_configs"
+    return sorted(entry.name.removesuffix(".yml") for entry in folder.iterdir() if entry.name.endswith(".yml"))
+
+
+def load_config(algo: str) -> dict[str, dict[str, Any]]:
+    """All entries of an algorithm's YAML file."""
+    _check("algo", algo, algorithms())
+    text = (resources.files("sb3_sap") / "zoo_configs" / f"{algo}.yml").read_text(encoding="utf-8")
+    entries: dict[str, dict[str, Any]] = yaml.safe_load(text)
+    return entries
+
+
+def preset_names(algo: str = "ddpg_ap") -> list[str]:
+    """The presets of an algorithm: the entries that are neither environments nor the default."""
+    return [name for name in load_config(algo) if "/" not in name and name != "default" and not name.endswith("-3k")]
+
+
+def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[str, Any]:
+    """Constructor arguments: ``DDPGAP("MlpPolicy", env, **preset("paper"))``.
+
+    :param name: such as ``"paper"``, the values of section 5.1
+    :param algo: the algorithm, by its RL Zoo name
+    :param steps: planned length of the training; None: the preset's own
+    """
+    _check("name", name, preset_names(algo))
+    entries = load_config(algo)
+    short = f"{name}-3k"
+    entry = entries[short if steps is not None and steps <= SHORT_RUN and short in entries else name]
+    return {key: value for key, value in entry.items() if key not in RUNNER_KEYS}
+
+
+def _check(argument: str, value: str, known: list[str]) -> None:
+    if value not in known:
+        near = difflib.get_close_matches(value, known, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(map(repr, known))}."
+        raise ValueError(f"`{argument}` = {value!r} is unknown: {hint}")

@@ -9,6 +9,7 @@ python benchmarks/predictor_defaults.py [--seeds 3] [--out docs/results/predicto
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,13 +22,14 @@ from sb3_sap.files import atomic_path
 
 STEPS, FROM = 2_000, 500
 FIRST_SEED = 100
-SETTINGS = {
+SGD = {"optimizer_class": "SGD", "learning_rate": 0.01}
+SETTINGS: dict[str, tuple[int, dict[str, Any]]] = {
     "paper: SGD 0.01, λ 0.01, N_E 2000": (
         2000,
         {"optimizer_class": "SGD", "learning_rate": 0.01, "weight_decay": 0.01},
     ),
-    "SGD 0.01, λ 0, N_E 2000": (2000, {"optimizer_class": "SGD", "learning_rate": 0.01, "weight_decay": 0.0}),
-    "SGD 0.01, λ 0.01, N_E 512": (512, {"optimizer_class": "SGD", "learning_rate": 0.01, "weight_decay": 0.01}),
+    "SGD 0.01, λ 0, N_E 2000": (2000, SGD | {"weight_decay": 0.0}),
+    "SGD 0.01, λ 0.01, N_E 512": (512, SGD | {"weight_decay": 0.01}),
     "default: Adam 0.001, λ 0.0001, N_E 512": (512, {}),
     "Adam 0.001, λ 0, N_E 512": (512, {"weight_decay": 0.0}),
     "Adam 0.001, λ 0.01, N_E 512": (512, {"weight_decay": 0.01}),

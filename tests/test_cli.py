@@ -1,0 +1,99 @@
+"""The commands that a user types."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+from sb3_sap import DDPGAP
+from sb3_sap.cli import main
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo")
+    assert main(["demo", "--steps", "400", "--out", str(out), "--seed", "101"]) == 0
+    return out
+
+
+def test_demo_leaves_what_it_promises(demo):
+    names = {path.name for path in demo.iterdir()}
+    pictures = {"learning_curve.png", "predictor.png", "lap.gif"}
+    assert names == {"model.zip", "training.csv", "evaluation.json"} | pictures
+    assert len(pd.read_csv(demo / "training.csv")) == 400
+    rows = json.loads((demo / "evaluation.json").read_text())
+    assert [row["track"] for row in rows] == ["eroad", "spring", "g-track-3", "ole-road-1"]
+    assert all(0 <= row["covered"] <= 1 for row in rows)
+    for name in pictures:
+        with Image.open(demo / name) as image:
+            assert image.getextrema() is not None
+    assert DDPGAP.load(demo / "model.zip").t_k == 150
+
+
+def test_evaluate_repeats_the_demos_laps(demo, tmp_path):
+    out = tmp_path / "laps.json"
+    assert main(["evaluate", str(demo / "model.zip"), "--tracks", "g-track-3", "--json", str(out)]) == 0
+    [row] = json.loads(out.read_text())
+    [before] = [row for row in json.loads((demo / "evaluation.json").read_text()) if row["track"] == "g-track-3"]
+    assert row == before
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap_ce2"])
+def test_every_algorithm_runs(algo, tmp_path):
+    out = tmp_path / "out"
+    assert main(["demo", "--algo", algo, "--steps", "60", "--no-animation", "--out", str(out)]) == 0
+    assert not (out / "lap.gif").exists()
+    assert (out / "evaluation.json").exists()
+
+
+def test_same_seed_same_rows(demo, tmp_path):
+    assert main(["demo", "--steps", "400", "--out", str(tmp_path), "--seed", "101", "--no-animation"]) == 0
+    assert (tmp_path / "training.csv").read_bytes() == (demo / "training.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["demo", "--track", "wheel2"], "did you mean 'wheel-2'"),
+        (["demo", "--preset", "papper"], "did you mean 'paper'"),
+        (["evaluate", "nothing.zip"], "There is no model file nothing.zip"),
+    ],
+)
+def test_errors_are_one_sentence(arguments, message, capsys):
+    assert main(arguments) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("sb3-sap: error: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["demo", "--steps", "0"], ["demo", "--algo", "ppo"], ["nothing"], []])
+def test_wrong_usage_exits_with_2(arguments):
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+
+
+@pytest.mark.parametrize("command", [[], ["demo"], ["evaluate"]])
+def test_help(command, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([*command, "--help"])
+    assert "usage: sb3-sap" in capsys.readouterr().out
+
+
+def test_ctrl_c_leaves_a_loadable_model(tmp_path):
+    command = [sys.executable, "-m", "sb3_sap.cli", "demo", "--steps", "100000", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
+    assert "learns 100,000 steps" in process.stdout.readline()
+    time.sleep(3)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in error
+    assert DDPGAP.load(tmp_path / "model.zip").num_timesteps > 0
+    assert len(pd.read_csv(tmp_path / "training.csv")) > 0

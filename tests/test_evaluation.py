@@ -1,0 +1,104 @@
+"""Laps driven with a policy alone, and what the demo shows of them."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from sb3_sap import DDPGAP
+from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS
+from sb3_sap.demo import TrainingLog, paper_score, results_table
+from sb3_sap.envs import get_track
+from sb3_sap.envs.lane_keeping import STEERING_LOCK
+from sb3_sap.evaluation import LapResult, drive_lap, load_policy, write_results
+
+
+class Feedback:
+    """Linear feedback that keeps the lane; full steering instead if ``lost``."""
+
+    def __init__(self, lost=False):
+        self.lost = lost
+
+    def predict(self, obs, deterministic):
+        assert deterministic
+        steering = 1.0 if self.lost else 2.5 * obs[0] / STEERING_LOCK - 5.0 * obs[1]
+        return np.clip(np.array([steering], dtype=np.float32), -1, 1), None
+
+
+def test_lap_of_a_good_driver():
+    result = drive_lap(Feedback(), "g-track-3")
+    length = get_track("g-track-3").length
+    assert result.lap_done
+    assert result.covered == 1
+    assert 0.9 < result.score < 1
+    assert result.score == pytest.approx(result.total_reward / (3.6 * length / 0.2))
+    # 50 km/h for 0.2 s are 2.78 m a step along the centre line, a little less or more on the inside or outside
+    assert result.steps == pytest.approx(length / (50 / 3.6 * 0.2), rel=0.02)
+
+
+def test_lap_of_a_lost_driver():
+    result = drive_lap(Feedback(lost=True), "g-track-3")
+    assert not result.lap_done
+    assert result.covered < 0.05
+
+
+def test_results_are_a_list_of_rows(tmp_path):
+    results = [LapResult("eroad", True, 1.0, 50_000.0, 0.85, 1174)]
+    write_results(tmp_path / "deep" / "evaluation.json", results)
+    [row] = json.loads((tmp_path / "deep" / "evaluation.json").read_text())
+    assert row == {
+        "track": "eroad",
+        "lap_done": True,
+        "covered": 1.0,
+        "total_reward": 50_000.0,
+        "score": 0.85,
+        "steps": 1174,
+    }
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["evaluation.json"]
+
+
+def test_policy_alone_equals_the_model(tmp_path):
+    model = DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0"), seed=0)
+    model.save(tmp_path / "model")
+    obs = np.random.default_rng(0).normal(size=(5, 5)).astype(np.float32)
+    policy = load_policy(tmp_path / "model.zip")
+    assert np.array_equal(policy.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+def test_truncated_and_missing_model_files(tmp_path):
+    model = DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0"))
+    model.save(tmp_path / "model.zip")
+    whole = (tmp_path / "model.zip").read_bytes()
+    for share in (0.0, 0.3, 0.9):
+        (tmp_path / "cut.zip").write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(ValueError, match=r"cut.zip is not a whole model file .* save the model again"):
+            load_policy(tmp_path / "cut.zip")
+    with pytest.raises(FileNotFoundError, match=r"There is no model file .*none.zip"):
+        load_policy(tmp_path / "none.zip")
+
+
+def test_papers_totals_give_the_scores_that_are_quoted():
+    cells = TABLE_2[15_000]["ddpg_ap"]
+    scores = [round(paper_score(track, cells[track].total_reward), 3) for track in TEST_TRACKS]
+    assert scores == [0.940, 0.950, 0.950, 0.967]
+
+
+def test_table_shows_the_papers_row():
+    console = Console(width=150, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(results_table([LapResult("eroad", False, 0.5, -10.0, -0.001, 7)], "ddpg", 3_000))
+    text = console.export_text()
+    assert "E-road" in text
+    assert "50.0%" in text
+    assert "17.6%" in text  # the paper's DDPG
+
+
+def test_training_log_has_a_row_for_every_step():
+    log = TrainingLog()
+    DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0", laps=None), seed=0, learning_starts=10).learn(60, callback=log)
+    table = pd.DataFrame(log.rows)
+    assert list(table["step"]) == list(range(1, 61))
+    assert (table.loc[table["off_track"], "reward"] == -200).all()
+    assert table["off_track"].any()

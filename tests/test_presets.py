@@ -1,0 +1,86 @@
+"""Presets come from zoo_configs; the paper's are those of section 5.1."""
+
+from importlib import resources
+
+import gymnasium as gym
+import pytest
+
+from sb3_sap import DDPGAP
+from sb3_sap.demo import ALGORITHMS
+from sb3_sap.presets import algorithms, load_config, preset, preset_names
+
+PAPER = {
+    "gamma": 0.9,
+    "tau": 0.001,
+    "learning_rate": 0.001,
+    "actor_learning_rate": 0.0001,
+    "batch_size": 128,
+    "buffer_size": 100_000,
+    "policy_kwargs": {"net_arch": [128, 256]},
+}
+PAPER_GUIDANCE = {
+    "alpha": 0.9,
+    "n_candidates": 128,
+    "knowledge_buffer_size": 10_000,
+    "validation_fraction": 0.1,
+    "dataset_size": 2_000,
+    "validation_size": 200,
+}
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap", "ddpg_ap_ce2"])
+def test_paper_values(algo):
+    found = preset("paper", algo)
+    expected = PAPER | (PAPER_GUIDANCE if "ap" in algo else {})
+    assert {key: found[key] for key in expected} == expected
+    assert found["action_noise"]["theta"] == 0.6
+    assert found["action_noise"]["sigma"] == 0.3
+    assert ("predictor_kwargs" in found) == ("ap" in algo)
+
+
+def test_predictor_of_the_paper():
+    predictor = preset("paper")["predictor_kwargs"]
+    assert predictor == {
+        "net_arch": [128, 256],
+        "optimizer_class": "SGD",
+        "learning_rate": 0.01,
+        "weight_decay": 0.01,
+        "batch_size": 128,
+    }
+
+
+def test_t_k_follows_the_length_of_the_run():
+    assert preset("paper")["t_k"] == 500
+    assert preset("paper", steps=15_000)["t_k"] == 500
+    assert preset("paper", steps=3_000)["t_k"] == 150
+
+
+def test_preset_as_typed():
+    env = gym.make("sap/LaneKeeping-v0")
+    model = DDPGAP("MlpPolicy", env, **preset("paper"))
+    assert model.predictor.optimizer.param_groups[0]["weight_decay"] == 0.01
+    assert (model.t_k, model.gamma, model.actor.optimizer.param_groups[0]["lr"]) == (500, 0.9, 0.001)
+    model.learn(3)  # the first update sets the actor's own rate
+    assert model.actor.optimizer.param_groups[0]["lr"] == 0.0001
+    assert model.critic.optimizer.param_groups[0]["lr"] == 0.001
+
+
+def test_every_config_is_installed_and_has_an_algorithm():
+    assert set(algorithms()) == set(ALGORITHMS)
+    for algo in algorithms():
+        assert "paper" in preset_names(algo)
+        assert "sap/LaneKeeping-v0" in load_config(algo)
+    assert (resources.files("sb3_sap") / "zoo_configs" / "ddpg_ap.yml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("papper",), "did you mean 'paper'"),
+        (("paper", "ddpg_pa"), "did you mean 'ddpg_ap'"),
+        (("x",), "one of 'paper'"),
+    ],
+)
+def test_unknown_names(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        preset(*arguments)

@@ -1,0 +1,32 @@
+"""Statistics of few, skewed runs: the interquartile mean and its interval, as in Agarwal et al. (2021)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from sb3_sap.permissibility import FloatArray
+
+
+def interquartile_mean(scores: np.ndarray[Any, Any]) -> float:
+    """Mean of the middle half of all runs on all tasks; (runs, tasks)."""
+    return float(stats.trim_mean(scores, 0.25, axis=None))
+
+
+def bootstrap_interval(
+    scores: FloatArray, confidence: float = 0.95, resamples: int = 2_000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile interval of the interquartile mean, resampling runs within each task (stratified bootstrap).
+
+    :param scores: (runs, tasks)
+    """
+    rng = np.random.default_rng(seed)
+    n_runs, n_tasks = scores.shape
+    chosen = rng.integers(n_runs, size=(resamples, n_runs, n_tasks))
+    resampled = scores[chosen, np.arange(n_tasks)]  # (resamples, runs, tasks)
+    means = stats.trim_mean(resampled.reshape(resamples, -1), 0.25, axis=1)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(means, [tail, 1 - tail])
+    return float(low), float(high)

@@ -96,7 +96,11 @@ def raises(obs, actions, next_obs):
         (lambda o, a, n: np.array([1.0, 0.0]), TypeError, "returned values of type float64, but must return bool"),
         (lambda o, a, n: np.array([np.nan, 1.0]), TypeError, "returned NaN, but must return bool"),
         (lambda o, a, n: True, ValueError, "returned an array of shape () for 2 actions, but must return shape (2,)"),
-        (lambda o, a, n: a > 0, ValueError, "returned an array of shape (2, 1) for 2 actions, but must return shape (2,)"),
+        (
+            lambda o, a, n: a > 0,
+            ValueError,
+            "returned an array of shape (2, 1) for 2 actions, but must return shape (2,)",
+        ),
         (lambda o, a, n: np.array([True]), ValueError, "returned an array of shape (1,) for 2 actions"),
     ],
 )

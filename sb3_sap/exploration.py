@@ -260,13 +260,16 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         super().set_parameters(load_path_or_dict, exact_match, device)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        if not isinstance(self.replay_buffer, KnowledgeMixin):
+        loaded = self.replay_buffer
+        if not isinstance(loaded, KnowledgeMixin):
+            self.replay_buffer = own
             raise TypeError(
-                f"The file holds a plain {type(self.replay_buffer).__name__} without a knowledge buffer: "
+                f"The file holds a plain {type(loaded).__name__} without a knowledge buffer: "
                 f"load one saved by {type(self).__name__}."
             )
-        self.replay_buffer.ap_function = self._resolved_ap_function()
+        loaded.ap_function = self._resolved_ap_function()
 
 
 def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: FloatArray, n: int) -> FloatArray:

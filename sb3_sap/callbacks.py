@@ -87,11 +87,23 @@ class PermissibilityCallback(BaseCallback):
 
 
 def contains_permissibility_callback(callback: object) -> bool:
-    """Whether the user's callbacks, however nested, bring a :class:`PermissibilityCallback` of their own."""
+    """Whether the user's callbacks, lists within lists, bring a :class:`PermissibilityCallback` of their own."""
     if isinstance(callback, PermissibilityCallback):
         return True
     if isinstance(callback, list):
-        return any(map(contains_permissibility_callback, callback))
+        return any([contains_permissibility_callback(child) for child in callback])
     if isinstance(callback, CallbackList):
         return contains_permissibility_callback(callback.callbacks)
-    return isinstance(callback, EventCallback) and contains_permissibility_callback(callback.callback)
+    if isinstance(callback, EventCallback):
+        _refuse_inside(callback)
+    return False
+
+
+def _refuse_inside(event: EventCallback) -> None:
+    # SB3's event callbacks pass the end of a rollout on to none of their children: E would never be trained.
+    children = [event.callback, getattr(event, "callback_on_new_best", None)]
+    if contains_permissibility_callback(children):
+        raise ValueError(
+            f"A PermissibilityCallback inside {type(event).__name__} would never train the AP predictor, because it is "
+            "not told there when a rollout ends: pass it to `learn(callback=[...])` itself."
+        )

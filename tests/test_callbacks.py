@@ -3,7 +3,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EveryNTimesteps
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import GUIDED, Line, build
@@ -155,6 +155,22 @@ def test_one_of_the_users_own_takes_the_place_of_the_default(wrap, progress_bar,
     build(DDPGAP).learn(30, callback=wrap(callback), progress_bar=progress_bar)
     assert fits == []
     assert callback.fits[-10:] == list(range(21, 31))
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda c: EveryNTimesteps(5, c),
+        lambda c: [NoCallback(), EvalCallback(DummyVecEnv([Line]), callback_after_eval=c)],
+        lambda c: EvalCallback(DummyVecEnv([Line]), callback_on_new_best=c),
+        lambda c: EvalCallback(DummyVecEnv([Line]), callback_after_eval=CallbackList([c])),
+    ],
+    ids=["EveryNTimesteps", "after_eval", "on_new_best", "list in after_eval"],
+)
+def test_inside_an_event_it_would_never_train_and_is_refused(wrap):
+    # SB3's event callbacks do not tell their children that a rollout has ended.
+    with pytest.raises(ValueError, match=r"inside (EveryNTimesteps|EvalCallback) would never train.*learn\(callback="):
+        build(DDPGAP).learn(30, callback=wrap(Recorder()))
 
 
 @pytest.mark.parametrize("label", [True, False])

@@ -208,9 +208,10 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     def _guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
         """Lines 5 to 14 of Algorithm 1, for all environments at once.
 
-        :param actions: (n_envs, action_dim) the actor's actions, scaled
+        :param actions: (n_envs, *action_shape) the actor's actions, scaled
         :return: the same with rejected ones replaced; None where nothing changed
         """
+        shape, actions = actions.shape, actions.reshape(len(actions), -1)
         consulted = np.flatnonzero(self._rng.random(len(actions)) < self.current_alpha)  # Alg. 1, line 5
         self.logger.record_mean("sap/consultation_rate", len(consulted) / len(actions))
         if len(consulted) == 0:
@@ -222,7 +223,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         self.logger.record_mean("sap/rejection_rate", len(rejected) / len(consulted))
         if len(rejected) == 0:
             return None
-        low, high = (bound[rejected] for bound in self._allowed_interval(len(actions)))
+        low, high = (b.reshape(actions.shape)[rejected] for b in self._allowed_interval(len(actions)))
         candidates = stratified_candidates(self._rng, low, high, self.n_candidates)  # Alg. 1, line 8
         permissible = self._permissible(features[rejected], candidates)  # Alg. 1, line 9
         found = permissible.any(axis=1)  # Alg. 1, line 10
@@ -230,7 +231,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         guided = actions.copy()
         for i in np.flatnonzero(found):
             guided[rejected[i]] = self._rng.choice(candidates[i, permissible[i]])  # Alg. 1, line 11
-        return guided
+        return guided.reshape(shape)
 
     def _permissible(self, features: th.Tensor, candidates: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """E's verdict on (n, N, action_dim) candidates for (n, features_dim) features: (n, N) bool."""

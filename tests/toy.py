@@ -84,9 +84,9 @@ def towards_centre(obs: Any, actions: Any, next_obs: Any) -> Any:
     return (np.abs(next_x) <= np.abs(x))[:, 0]
 
 
-def one_sided(obs: Any, previous_obs: Any, last_action: Any) -> tuple[Any, Any]:
-    """A stub constraint: never lower than the action before."""
-    return last_action, np.ones_like(last_action)
+def nearby(obs: Any, previous_obs: Any, last_action: Any) -> tuple[Any, Any]:
+    """A stub constraint: within 0.5 of the action before."""
+    return last_action - 0.5, last_action + 0.5
 
 
 NOT_A_FUNCTION = 3
@@ -110,6 +110,6 @@ def build(algorithm: Any, env: Any = None, **overrides: Any) -> Any:
             "predictor_kwargs": {"net_arch": [8], "batch_size": 16},
         }
     if algorithm in CONSTRAINED:
-        settings |= {"constraint": one_sided}
+        settings |= {"constraint": nearby}
     policy = overrides.pop("policy", "MlpPolicy")
     return algorithm(policy, Line() if env is None else env, **(settings | overrides))

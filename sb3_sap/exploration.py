@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -252,7 +253,9 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        if exact_match and isinstance(load_path_or_dict, dict) and "predictor" not in load_path_or_dict:
+        if not isinstance(load_path_or_dict, dict):
+            _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
+        if exact_match and "predictor" not in load_path_or_dict:
             # Not a ValueError: `load` takes that for an old file and buries it under a KeyError.
             raise TypeError(
                 f"These parameters hold no AP predictor, so a plain algorithm saved them: build {type(self).__name__} "

@@ -1,5 +1,4 @@
 import json
-import re
 import zipfile
 
 import numpy as np
@@ -221,3 +220,17 @@ def test_checkpoints_load(tmp_path):
     assert len(loaded.replay_buffer.knowledge) == 39
     loaded.learn(10, reset_num_timesteps=False)
     assert len(loaded.replay_buffer.knowledge) == 49
+
+
+@pytest.mark.parametrize("algorithm", [DDPG, DDPGAP])
+def test_a_truncated_file_gives_one_clear_error(algorithm, tmp_path):
+    path = tmp_path / "model.zip"
+    build(algorithm).save(path)
+    whole = path.read_bytes()
+    for length in [*range(0, len(whole), 1009), len(whole) - 1]:
+        path.write_bytes(whole[:length])
+        # torch's files are archives of their own: cut behind one, the file still looks like an archive.
+        with pytest.raises(ValueError, match=r"model\.zip.* (wasn't a zip-file|holds no whole model)"):
+            algorithm.load(path)
+    path.write_bytes(whole)
+    algorithm.load(path)

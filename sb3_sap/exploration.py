@@ -106,12 +106,6 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         for name, minimum in least.items():
             if getattr(self, name) < minimum:
                 raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(self, name)}.")
-        room = self.knowledge_buffer_size * (1 - self.validation_fraction) / 2
-        if self.min_per_class > room:
-            raise ValueError(
-                f"`min_per_class` = {self.min_per_class} can never be reached: `knowledge_buffer_size` = "
-                f"{self.knowledge_buffer_size} has room for {room:.0f} training examples of each class."
-            )
         if self.noise_steps > self.learning_starts and self.action_noise is None and not self.use_sde:
             warnings.warn(
                 f"`t_k` = {self.t_k} is beyond `learning_starts` = {self.learning_starts}, but there is no "
@@ -133,6 +127,12 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
             self.validation_fraction,
             self.seed,
         )
+        room = knowledge.parts["train"].capacity // 2
+        if self.min_per_class > room:
+            raise ValueError(
+                f"`min_per_class` = {self.min_per_class} can never be reached: `knowledge_buffer_size` = "
+                f"{self.knowledge_buffer_size} has room for {room} training examples of each class."
+            )
         return buffer_class(
             self.buffer_size,
             self.observation_space,

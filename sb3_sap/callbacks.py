@@ -54,8 +54,8 @@ class PermissibilityCallback(BaseCallback):
         if min(knowledge.counts("train")) >= self.model.min_per_class:
             for _ in range(self._steps):
                 self.fit()
-        elif not self._warned and len(knowledge) >= CONSTANT_LABELS_WARNING:
-            self._warn_of_constant_labels(knowledge.counts("train"))
+        if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
+            self._warn_of_constant_labels(knowledge.seen)
         if self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
             self.validate()
 
@@ -76,24 +76,34 @@ class PermissibilityCallback(BaseCallback):
         self.logger.record("sap/validation_accuracy_non_permissible", non_permissible)
         self.logger.record("sap/alpha", model.current_alpha)
 
-    def _warn_of_constant_labels(self, counts: tuple[int, int]) -> None:
-        if min(counts) > 0:
-            return
+    def _warn_of_constant_labels(self, seen: list[int]) -> None:
         self._warned = True
-        label = "permissible" if counts[NON_PERMISSIBLE] == 0 else "non-permissible"
+        label = "permissible" if seen[NON_PERMISSIBLE] == 0 else "non-permissible"
         warnings.warn(
-            f"The AP function labelled all of the first {sum(counts)} training examples {label}: from constant labels "
+            f"The AP function labelled all of the first {sum(seen)} actions {label}: from constant labels "
             "nothing can be learned, and the run equals one without guidance. Check the AP function.",
             stacklevel=2,
         )
 
 
 def contains_permissibility_callback(callback: object) -> bool:
-    """Whether the user's callbacks, however nested, bring a :class:`PermissibilityCallback` of their own."""
+    """Whether the user's callbacks, lists within lists, bring a :class:`PermissibilityCallback` of their own."""
     if isinstance(callback, PermissibilityCallback):
         return True
     if isinstance(callback, list):
-        return any(map(contains_permissibility_callback, callback))
+        return any([contains_permissibility_callback(child) for child in callback])
     if isinstance(callback, CallbackList):
         return contains_permissibility_callback(callback.callbacks)
-    return isinstance(callback, EventCallback) and contains_permissibility_callback(callback.callback)
+    if isinstance(callback, EventCallback):
+        _refuse_inside(callback)
+    return False
+
+
+def _refuse_inside(event: EventCallback) -> None:
+    # SB3's event callbacks pass the end of a rollout on to none of their children: E would never be trained.
+    children = [event.callback, getattr(event, "callback_on_new_best", None)]
+    if contains_permissibility_callback(children):
+        raise ValueError(
+            f"A PermissibilityCallback inside {type(event).__name__} would never train the AP predictor, because it is "
+            "not told there when a rollout ends: pass it to `learn(callback=[...])` itself."
+        )

@@ -70,21 +70,24 @@ class ConstrainedExplorationMixin(SettingsMixin):
         if self._constraint is None:
             return action, scaled
         low, high = self._allowed_interval(n_envs)
-        outside = ((scaled < low) | (scaled > high)).any(axis=1)
+        outside = ((scaled < low) | (scaled > high)).reshape(n_envs, -1).any(axis=1)
         if outside.any():
             scaled[outside] = self._rng.uniform(low[outside], high[outside])
             action = self.policy.unscale_action(scaled)
         return action, scaled
 
     def _allowed_interval(self, n_envs: int) -> tuple[FloatArray, FloatArray]:
-        """The scaled actions that the constraint allows now: (n_envs, action_dim) low and high."""
+        """The scaled actions that the constraint allows now: low and high, each (n_envs, *action_shape)."""
         high = np.ones((n_envs, *cast(Any, self.action_space).shape), dtype=np.float32)
         low = -high
         if self._constraint is not None:
             for i, previous in enumerate(self._previous):
                 if previous is not None:
                     interval = self._constraint(_row(self._raw_last_obs(), i), *previous)
-                    low[i], high[i] = (self.policy.scale_action(np.asarray(bound)) for bound in interval)
+                    # An interval may reach beyond the action space; what counts is the part inside.
+                    low[i], high[i] = (np.clip(self.policy.scale_action(np.asarray(b)), -1, 1) for b in interval)
+                    if not (low[i] <= high[i]).all():
+                        raise ValueError(f"`constraint` must return (low, high) with low <= high, but gave {interval}.")
         return low, high
 
     def _raw_last_obs(self) -> Any:

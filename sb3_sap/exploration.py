@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -105,12 +106,6 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         for name, minimum in least.items():
             if getattr(self, name) < minimum:
                 raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(self, name)}.")
-        room = self.knowledge_buffer_size * (1 - self.validation_fraction) / 2
-        if self.min_per_class > room:
-            raise ValueError(
-                f"`min_per_class` = {self.min_per_class} can never be reached: `knowledge_buffer_size` = "
-                f"{self.knowledge_buffer_size} has room for {room:.0f} training examples of each class."
-            )
         if self.noise_steps > self.learning_starts and self.action_noise is None and not self.use_sde:
             warnings.warn(
                 f"`t_k` = {self.t_k} is beyond `learning_starts` = {self.learning_starts}, but there is no "
@@ -132,6 +127,12 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
             self.validation_fraction,
             self.seed,
         )
+        room = knowledge.parts["train"].capacity // 2
+        if self.min_per_class > room:
+            raise ValueError(
+                f"`min_per_class` = {self.min_per_class} can never be reached: `knowledge_buffer_size` = "
+                f"{self.knowledge_buffer_size} has room for {room} training examples of each class."
+            )
         return buffer_class(
             self.buffer_size,
             self.observation_space,
@@ -209,9 +210,10 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     def _guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
         """Lines 5 to 14 of Algorithm 1, for all environments at once.
 
-        :param actions: (n_envs, action_dim) the actor's actions, scaled
+        :param actions: (n_envs, *action_shape) the actor's actions, scaled
         :return: the same with rejected ones replaced; None where nothing changed
         """
+        shape, actions = actions.shape, actions.reshape(len(actions), -1)
         consulted = np.flatnonzero(self._rng.random(len(actions)) < self.current_alpha)  # Alg. 1, line 5
         self.logger.record_mean("sap/consultation_rate", len(consulted) / len(actions))
         if len(consulted) == 0:
@@ -223,7 +225,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         self.logger.record_mean("sap/rejection_rate", len(rejected) / len(consulted))
         if len(rejected) == 0:
             return None
-        low, high = (bound[rejected] for bound in self._allowed_interval(len(actions)))
+        low, high = (b.reshape(actions.shape)[rejected] for b in self._allowed_interval(len(actions)))
         candidates = stratified_candidates(self._rng, low, high, self.n_candidates)  # Alg. 1, line 8
         permissible = self._permissible(features[rejected], candidates)  # Alg. 1, line 9
         found = permissible.any(axis=1)  # Alg. 1, line 10
@@ -231,7 +233,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         guided = actions.copy()
         for i in np.flatnonzero(found):
             guided[rejected[i]] = self._rng.choice(candidates[i, permissible[i]])  # Alg. 1, line 11
-        return guided
+        return guided.reshape(shape)
 
     def _permissible(self, features: th.Tensor, candidates: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """E's verdict on (n, N, action_dim) candidates for (n, features_dim) features: (n, N) bool."""
@@ -252,7 +254,9 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        if exact_match and isinstance(load_path_or_dict, dict) and "predictor" not in load_path_or_dict:
+        if not isinstance(load_path_or_dict, dict):
+            _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
+        if exact_match and "predictor" not in load_path_or_dict:
             # Not a ValueError: `load` takes that for an old file and buries it under a KeyError.
             raise TypeError(
                 f"These parameters hold no AP predictor, so a plain algorithm saved them: build {type(self).__name__} "
@@ -261,13 +265,16 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         super().set_parameters(load_path_or_dict, exact_match, device)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
+        own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        if not isinstance(self.replay_buffer, KnowledgeMixin):
+        loaded = self.replay_buffer
+        if not isinstance(loaded, KnowledgeMixin):
+            self.replay_buffer = own
             raise TypeError(
-                f"The file holds a plain {type(self.replay_buffer).__name__} without a knowledge buffer: "
+                f"The file holds a plain {type(loaded).__name__} without a knowledge buffer: "
                 f"load one saved by {type(self).__name__}."
             )
-        self.replay_buffer.ap_function = self._resolved_ap_function()
+        loaded.ap_function = self._resolved_ap_function()
 
 
 def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: FloatArray, n: int) -> FloatArray:

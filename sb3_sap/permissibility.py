@@ -72,13 +72,13 @@ def resolve(function: F | str, argument: str) -> F:
     """
     if callable(function):
         return function
-    if not isinstance(function, str) or "." not in function:
+    parts = function.split(".") if isinstance(function, str) else []
+    if len(parts) < 2 or not all(map(str.isidentifier, parts)):
         raise TypeError(
             f"`{argument}` must be a function or its dotted name 'package.module.function', but is {function!r}."
         )
-    module, _, name = function.rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), name)
+        found = getattr(importlib.import_module(".".join(parts[:-1])), parts[-1])
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"`{argument}`: {function!r} cannot be imported ({error}): give 'package.module.function' "

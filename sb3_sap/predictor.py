@@ -113,7 +113,8 @@ class PermissibilityPredictor(BaseModel):
 
     def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """(n,) logits; above zero means permissible."""
-        return self.head(th.cat([features, actions], dim=1)).squeeze(1)  # type: ignore[no-any-return]
+        # A float64 action space brings float64 actions.
+        return self.head(th.cat([features, actions.to(features.dtype)], dim=1)).squeeze(1)  # type: ignore[no-any-return]
 
     def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of n observations and (n, action_dim) scaled actions."""

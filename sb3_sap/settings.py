@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from io import BufferedIOBase
+from pathlib import Path
 from typing import Any, Self, cast
 
 import numpy as np
@@ -12,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 #: Training steps of the paper's main experiment (section 5.2).
@@ -85,6 +87,28 @@ class SettingsMixin(OffPolicyAlgorithm):
             reset_num_timesteps,
             progress_bar,
         )
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path | BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """SB3's ``load``, which says so when a file was cut short."""
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except AssertionError as error:
+            # Cut short behind one of torch's files, which are archives themselves, a file still passes for an archive.
+            if "in the saved file" not in str(error):
+                raise
+            raise ValueError(
+                f"The file {path} holds no whole model: was it cut short, or not written by save?"
+            ) from error
 
 
 def check_action_space(algorithm: str, space: spaces.Space[Any]) -> None:

@@ -1,0 +1,400 @@
+"""Algorithm 1 line by line, with a stub actor and a stub predictor.
+
+The actor's actions are sums of powers of two, which SB3's scaling and unscaling returns to the bit.
+"""
+
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from toy import GUIDED, Line, build, nearby
+
+from sb3_sap import DDPG, DDPGAP, DDPGAPCE2
+from sb3_sap.exploration import stratified_candidates
+
+
+class StubPredictor:
+    """E with a rule (obs, actions) -> logits, that counts what it is asked."""
+
+    def __init__(self, rule, fitted=True):
+        self.rule, self.fitted = rule, fitted
+        self.asked = []  # number of rows of each call
+
+    def features(self, obs):
+        return obs
+
+    def logits(self, features, actions):
+        self.asked.append(len(actions))
+        return self.rule(features, actions)
+
+    def fit(self, dataset):
+        return 0.0
+
+    def recall(self, dataset):
+        return 1.0, 1.0
+
+
+class Constant(ActionNoise):
+    def __init__(self, value):
+        self.value, self.calls = value, 0
+
+    def __call__(self):
+        self.calls += 1
+        return np.array([self.value], dtype=np.float32)
+
+
+def above(border):
+    return lambda obs, actions: actions[:, 0] - border
+
+
+def never(obs, actions):
+    raise AssertionError("E must not be consulted here")
+
+
+def deny(obs, actions):
+    return -th.ones(len(actions))
+
+
+def guided(actor, rule, *, alpha=1.0, obs=None, n_candidates=4, fitted=True, algorithm=DDPGAP, env=None, **settings):
+    """A model past t_k whose actor answers ``actor`` (env units) and whose E follows ``rule``."""
+    model = build(algorithm, env, alpha=alpha, alpha_low=alpha, n_candidates=n_candidates, **settings)
+    model.predictor = StubPredictor(rule, fitted)
+    model.predict = lambda obs, deterministic: (np.array(actor, dtype=model.action_space.dtype), None)
+    model.set_logger(Logger(None, []))
+    model._last_obs = np.zeros((len(actor), 2), np.float32) if obs is None else np.array(obs, np.float32)
+    model._last_original_obs = model._last_obs
+    model._previous = [None] * len(actor)
+    model.num_timesteps = 10_000
+    return model
+
+
+def sample(model, noise=None):
+    return model._sample_action(model.learning_starts, noise, len(model._last_obs))
+
+
+@pytest.mark.parametrize("steps_taken", [10, 19])
+def test_until_t_k_actor_and_noise_and_no_consultation(steps_taken):  # lines 1-4
+    model = guided([[0.125]], never, learning_starts=10, t_k=20, action_noise=Constant(0.25))
+    model.num_timesteps = steps_taken  # the step about to be taken is t = steps_taken + 1 <= t_k
+    action, scaled = sample(model, model.action_noise)
+    assert action == scaled == pytest.approx(0.375)
+
+
+def test_the_uniform_warm_up_counts_inside_t_k():
+    model = guided([[0.125]], never, learning_starts=10, t_k=20, action_noise=Constant(0.0))
+    model.num_timesteps = 9
+    model.action_space.sample = lambda: np.float32([0.75])
+    assert sample(model, model.action_noise)[1] == 0.75
+
+
+def test_after_t_k_no_noise():  # line 2
+    model = guided([[0.125]], above(0), learning_starts=10, t_k=20, action_noise=Constant(0.25))
+    model.num_timesteps = 20
+    action, scaled = sample(model, model.action_noise)
+    assert action == scaled == np.float32(0.125)
+    assert model.action_noise.calls == 0
+    assert model.predictor.asked == [1]
+
+
+def test_after_t_k_no_warm_up():
+    model = guided([[0.125]], above(0), learning_starts=10, t_k=5)
+    model.num_timesteps = 5
+    model.action_space.sample = Mock(side_effect=AssertionError)
+    assert sample(model)[1] == np.float32(0.125)
+
+
+def test_not_consulted():  # line 5
+    action, scaled = sample(guided([[-0.25]], never, alpha=0.0))
+    assert action == scaled == np.float32(-0.25)
+
+
+def test_not_consulted_before_the_first_fit():
+    action, scaled = sample(guided([[-0.25]], never, fitted=False))
+    assert action == scaled == np.float32(-0.25)
+
+
+def test_permissible_action_is_kept():  # lines 6-7
+    model = guided([[0.125]], above(0))
+    action, scaled = sample(model)
+    assert action == scaled == np.float32(0.125)
+    assert model.predictor.asked == [1]
+
+
+def test_a_logit_of_zero_is_not_permissible():
+    assert sample(guided([[0.25]], above(0.25)))[1] > 0.25
+
+
+def test_rejected_action_is_replaced_by_a_permissible_candidate():  # lines 8-11
+    model = guided([[-0.25]], above(0.5))
+    action, scaled = sample(model)
+    assert 0.5 < scaled.item() <= 1  # only the last of the four strata of [-1, 1] is permissible
+    np.testing.assert_allclose(action, scaled, rtol=1e-6)
+    assert model.predictor.asked == [1, 4]
+
+
+def test_candidates_cover_the_action_space_and_one_is_taken_at_random():  # lines 8 and 11
+    model = guided([[-0.25]] * 4000, above(0))
+    scaled = sample(model)[1]
+    assert scaled.min() > 0
+    # The third and fourth stratum are equally likely: 2000 each, standard deviation 32.
+    assert np.sum(scaled > 0.5) == pytest.approx(2000, abs=130)
+    counts, _ = np.histogram(scaled, bins=8, range=(0, 1))
+    assert counts == pytest.approx([500] * 8, abs=85)
+
+
+def test_without_permissible_candidates_the_actor_decides():  # line 10
+    model = guided([[-0.25]], deny)
+    action, scaled = sample(model)
+    assert action == scaled == np.float32(-0.25)
+    assert model.predictor.asked == [1, 4]
+    assert model.logger.name_to_value["sap/fallback_rate"] == 1
+
+
+def test_alpha_is_the_probability_of_consulting():  # line 5
+    scaled = sample(guided([[-0.25]] * 4000, above(0), alpha=0.3))[1]
+    assert np.sum(scaled > 0) == pytest.approx(1200, abs=116)  # 4 standard deviations
+
+
+def test_several_environments_at_once_with_one_call_for_all_candidates():
+    # Permissible means: the sign of the environment's own observation. Environment 2 has nothing permissible.
+    model = guided(
+        [[-0.5], [-0.375], [0.25], [0.5], [0.125]],
+        lambda obs, actions: actions[:, 0] * obs[:, 0],
+        obs=[[1, 0], [-1, 0], [0, 0], [-1, 0], [1, 0]],
+    )
+    action, scaled = sample(model)
+    assert scaled[0] > 0
+    assert scaled[1] == np.float32(-0.375)
+    assert scaled[2] == np.float32(0.25)
+    assert scaled[3] < 0
+    assert scaled[4] == np.float32(0.125)
+    np.testing.assert_allclose(action, scaled, rtol=1e-6)
+    assert model.predictor.asked == [5, 3 * 4]
+    values = model.logger.name_to_value
+    assert values["sap/consultation_rate"] == 1
+    assert values["sap/rejection_rate"] == pytest.approx(3 / 5)
+    assert values["sap/fallback_rate"] == pytest.approx(1 / 3)
+
+
+def test_only_the_consulted_are_replaced_and_each_by_its_own_observation():
+    signs = np.where(np.arange(200) % 3 == 0, 1.0, -1.0)
+    obs = np.stack([signs, np.zeros(200)], axis=1)
+    actor = -0.125 * signs[:, None]  # always wrong
+    model = guided(actor, lambda obs, actions: actions[:, 0] * obs[:, 0], alpha=0.5, obs=obs)
+    scaled = sample(model)[1][:, 0]
+    kept = scaled == np.float32(actor[:, 0])
+    assert 70 < kept.sum() < 130
+    assert (np.sign(scaled[~kept]) == signs[~kept]).all()
+    rate = model.logger.name_to_value["sap/consultation_rate"]
+    assert model.predictor.asked == [round(200 * rate), 4 * round(200 * rate)]
+    assert (~kept).sum() == round(200 * rate)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_two_dimensions_and_other_bounds(dtype):
+    # Scaled, the actor's (4, 6) of [2, 10]² is (-1/2, 0); permissible is where both are above 1/2: one stratum each.
+    env = Line(dim=2, low=2.0, high=10.0, action_dtype=dtype)
+    model = guided([[4, 6]] * 300, lambda obs, actions: actions.min(dim=1).values - 0.5, env=env)
+    action, scaled = sample(model)
+    replaced = scaled[:, 0] != -0.5
+    # Latin hypercube: the last stratum of both dimensions meets with probability 1/4.
+    assert replaced.sum() == pytest.approx(75, abs=30)
+    assert (scaled[replaced] > 0.5).all()
+    np.testing.assert_array_equal(scaled[~replaced], [[-0.5, 0]] * (~replaced).sum())
+    np.testing.assert_allclose(action, 6 + 4 * scaled, rtol=1e-6)
+    assert action.shape == scaled.shape == (300, 2)
+
+
+def test_an_action_space_of_shape_2_by_2():
+    env = Line()
+    env.action_space = spaces.Box(-1, 1, (2, 2), np.float32)
+    actor = np.full((3, 2, 2), -0.2)
+    model = guided(actor, lambda obs, actions: actions[:, 3], env=env)
+    scaled = sample(model)[1]
+    assert scaled.shape == (3, 2, 2)
+    assert (scaled[:, 1, 1] > 0).all()
+
+
+def test_float64_action_space_trains():
+    model = build(DDPGAP, Line(action_dtype=np.float64), alpha=1.0, alpha_low=1.0).learn(80)
+    assert model.predictor.fitted
+
+
+@pytest.mark.parametrize("low", [-1.0, 3.0])
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_both_buffers_hold_the_executed_action(algorithm, low):
+    env = DummyVecEnv([lambda: Line(dim=2, low=low, high=5.0)] * 2)
+    model = build(algorithm, env, alpha=1.0, alpha_low=1.0, n_candidates=8, t_k=10)
+    model.predictor = StubPredictor(lambda obs, actions: actions[:, 0] - 0.6)
+    model.learn(80)
+    assert model.predictor.asked
+    stored = model.replay_buffer.actions[:40]  # (40, 2 environments, 2 dimensions)
+    executed = np.stack([inner.executed for inner in env.envs], axis=1)
+    np.testing.assert_allclose(low + (stored + 1) / 2 * (5 - low), executed, rtol=1e-5, atol=1e-5)
+    assert (stored[10:, :, 0] > 0.6).mean() > 0.8  # guidance did act
+    knowledge = model.replay_buffer.knowledge
+    in_k = np.concatenate([knowledge.actions[knowledge._offset[p] :][: len(s)] for p, s in knowledge.parts.items()])
+    np.testing.assert_array_equal(np.sort(in_k, axis=0), np.sort(stored.reshape(-1, 2), axis=0))
+
+
+def test_predict_is_the_actor_alone():
+    model = build(DDPGAP, alpha=1.0, alpha_low=1.0).learn(30)
+    model.predictor = StubPredictor(never)
+    obs = np.array([0.3, 0.1], dtype=np.float32)
+    expected = model.actor(th.tensor(obs[None])).detach().numpy()[0]
+    np.testing.assert_allclose(model.predict(obs)[0], expected, atol=1e-6)
+
+
+# ---------------------------------------------------------------- A_st
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_one_candidate_per_stratum_in_each_dimension(dim):
+    low = np.float32([[-1] * dim, [0] * dim])
+    high = np.float32([[1] * dim, [10] * dim])
+    candidates = stratified_candidates(np.random.default_rng(0), low, high, 16)
+    assert candidates.shape == (2, 16, dim)
+    assert candidates.dtype == np.float32
+    strata = np.floor((candidates - low[:, None]) / (high - low)[:, None] * 16)
+    np.testing.assert_array_equal(np.sort(strata, axis=1), np.broadcast_to(np.arange(16)[:, None], (2, 16, dim)))
+
+
+def test_dimensions_and_rows_are_paired_at_random():
+    zeros = np.zeros((2, 2), np.float32)
+    candidates = stratified_candidates(np.random.default_rng(0), zeros, zeros + 1, 1000)
+    for row in candidates:
+        assert abs(np.corrcoef(row.T)[0, 1]) < 0.13  # 4 standard deviations
+    assert abs(np.corrcoef(candidates[0, :, 0], candidates[1, :, 0])[0, 1]) < 0.13
+
+
+def test_candidates_are_uniform_within_the_bounds():
+    low, high = np.float32([[-0.3]]), np.float32([[0.1]])
+    rng = np.random.default_rng(0)
+    draws = np.concatenate([stratified_candidates(rng, low, high, 4).ravel() for _ in range(2000)])
+    assert low <= draws.min() < -0.299
+    assert 0.099 < draws.max() <= high
+    assert np.mean(draws) == pytest.approx(-0.1, abs=0.001)
+    # Each tenth of the interval, across the borders of the quarters, holds a tenth: 800, standard deviation < 27.
+    counts, _ = np.histogram(draws, bins=10, range=(-0.3, 0.1))
+    assert counts == pytest.approx([800] * 10, abs=108)
+
+
+def test_an_interval_of_one_point_gives_that_point():
+    point = np.float32([[0.125]])
+    assert (stratified_candidates(np.random.default_rng(0), point, point, 5) == point).all()
+
+
+# ---------------------------------------------------------------- whole runs
+
+
+def test_t_k_left_open_is_learning_starts():
+    assert build(DDPGAP, learning_starts=17).noise_steps == 17
+    assert build(DDPGAP, learning_starts=17, t_k=0).noise_steps == 0
+    assert build(DDPGAP, learning_starts=17, t_k=40, action_noise=Constant(0.0)).noise_steps == 40
+
+
+def test_noise_ends_with_t_k_and_a_second_learn_does_not_bring_it_back():
+    model = build(DDPGAP, learning_starts=10, t_k=20, action_noise=Constant(0.1), alpha=0.0)
+    predicted = []
+    predict = model.predict
+    model.predict = lambda *args, **kwargs: predicted.append(model.num_timesteps) or predict(*args, **kwargs)
+    model.learn(30)
+    assert model.action_noise.calls == 20  # also while SB3 draws uniformly
+    assert predicted == list(range(10, 30))
+    predicted.clear()
+    model.learn(5)
+    assert model.num_timesteps == 5
+    assert model.action_noise.calls == 20
+    assert predicted == list(range(5))
+    model.learn(5, reset_num_timesteps=False)
+    assert model.action_noise.calls == 20
+
+
+def test_t_k_is_counted_over_several_short_learns():
+    model = build(DDPGAP, learning_starts=0, t_k=20, action_noise=Constant(0.1), alpha=0.0)
+    for _ in range(2):
+        model.learn(8)
+    model.learn(8, reset_num_timesteps=False)
+    assert model.action_noise.calls == 20
+
+
+def tensors(model):
+    """Everything a model has learned, by name."""
+    found = {}
+    for name, state in model.get_parameters().items():
+        if name.startswith("predictor"):
+            continue
+        if "optimizer" in name:
+            for index, entry in state["state"].items():
+                found |= {f"{name}.{index}.{key}": value for key, value in entry.items()}
+        else:
+            found |= {f"{name}.{key}": value for key, value in state.items()}
+    return found
+
+
+def assert_same_to_the_bit(one, other):
+    states = tensors(one), tensors(other)
+    assert states[0].keys() == states[1].keys()
+    for name, value in states[0].items():
+        assert th.equal(value, states[1][name]), name
+    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+        a, b = (getattr(m.replay_buffer, name) for m in (one, other))
+        np.testing.assert_array_equal(a, b, err_msg=name)
+
+
+def normalised():
+    return VecNormalize(DummyVecEnv([Line]))
+
+
+def three():
+    return DummyVecEnv([Line] * 3)
+
+
+@pytest.mark.parametrize("make_env", [Line, three, normalised], ids=["one", "three", "VecNormalize"])
+@pytest.mark.parametrize("algorithm", [DDPG, DDPGAP])
+def test_unguided_it_equals_ddpg_to_the_bit(algorithm, make_env):
+    def noise():
+        return NormalActionNoise(np.zeros(1), 0.3 * np.ones(1))
+
+    runs = []
+    for cls in (stable_baselines3.DDPG, algorithm):
+        extra = {"alpha": 0.0, "t_k": 1000} if cls is DDPGAP else {}
+        runs.append(build(cls, make_env(), action_noise=noise(), **extra).learn(150))
+    assert_same_to_the_bit(*runs)
+    if algorithm is DDPGAP:
+        assert runs[1].predictor.fitted
+
+
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_same_seed_same_bits_and_guidance_makes_a_difference(algorithm):
+    settings = {"alpha_low": 0.9, "action_noise": Constant(0.0)}
+    one, same = (build(algorithm, **settings).learn(150) for _ in range(2))
+    assert_same_to_the_bit(one, same)
+    for name, value in one.predictor.state_dict().items():
+        assert th.equal(value, same.predictor.state_dict()[name])
+    unguided = build(algorithm, **(settings | {"alpha": 0.0})).learn(150)
+    assert not np.array_equal(one.replay_buffer.actions, unguided.replay_buffer.actions)
+    other = build(algorithm, seed=2, **settings).learn(150)
+    assert not np.array_equal(one.replay_buffer.actions, other.replay_buffer.actions)
+
+
+def test_with_a_constraint_the_candidates_come_from_its_interval():
+    # E allows what is above -0.5, the constraint what is within 0.5 of the last action.
+    model = guided([[-0.75]] * 500, above(-0.5), algorithm=DDPGAPCE2, constraint=nearby)
+    model._previous = [(np.zeros(2), np.float32([0.5]))] * 500
+    scaled = sample(model)[1]
+    assert scaled.min() >= 0
+    assert model.predictor.asked == [500]  # the uniform draw from [0, 1] already pleases E
+    model.predictor.rule = above(0.75)
+    model.predictor.asked.clear()
+    scaled = sample(model)[1]
+    # Of the four strata of [0, 1] the last, [0.75, 1], is permissible.
+    assert scaled.min() > 0.75
+    assert model.predictor.asked[0] == 500
+    assert model.predictor.asked[1] == pytest.approx(4 * 375, abs=160)

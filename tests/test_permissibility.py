@@ -1,0 +1,126 @@
+import re
+
+import numpy as np
+import pytest
+import toy
+
+from sb3_sap import ActionPermissibility
+from sb3_sap.permissibility import labels_from_function, labels_from_infos, resolve
+
+
+def closer(obs, action, next_obs):
+    return bool(abs(next_obs[0]) <= abs(obs[0]))
+
+
+@pytest.mark.parametrize("reuse", [False, True], ids=["fresh arrays", "one array written over"])
+def test_wrapper_labels_with_the_observation_before_the_step(reuse):
+    env = ActionPermissibility(toy.Line(labels=False, reuse=reuse), closer)
+    env.reset(options={"x": 0.5})
+    labels = [env.step(np.array([action]))[4]["permissible"] for action in (-1.0, 1.0, 1.0, -1.0)]
+    assert labels == [True, False, False, True]  # x: 0.5 -> 0.4 -> 0.5 -> 0.6 -> 0.5
+
+
+def test_wrapper_starts_afresh_after_a_reset():
+    env = ActionPermissibility(toy.Line(labels=False, reuse=True), lambda obs, action, next_obs: float(obs[1]) == 0.0)
+    env.reset(seed=0)
+    assert env.step(np.array([0.0]))[4]["permissible"]  # time 0 at the reset
+    assert not env.step(np.array([0.0]))[4]["permissible"]
+    env.reset()
+    assert env.step(np.array([0.0]))[4]["permissible"]
+
+
+def test_wrapper_hands_over_action_and_both_dict_observations():
+    seen = []
+
+    def permissible(obs, action, next_obs):
+        seen.append((obs["time"].item(), action.item(), next_obs["time"].item()))
+        return True
+
+    env = ActionPermissibility(toy.Line("dict", labels=False), permissible)
+    env.reset(seed=0)
+    info = env.step(np.array([0.25]))[4]
+    assert info == {"permissible": True}
+    assert seen == [(0.0, 0.25, pytest.approx(0.1))]
+
+
+def test_wrapper_wants_a_function():
+    with pytest.raises(TypeError, match=r"`permissible` must be a function \(obs, action, next_obs\) -> bool.*is True"):
+        ActionPermissibility(toy.Line(), True)
+
+
+def test_resolve_returns_functions_and_imports_names():
+    assert resolve(closer, "ap_function") is closer
+    assert resolve("toy.towards_centre", "ap_function") is toy.towards_centre
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        (3, TypeError, r"`ap_function` must be a function or its dotted name .*, but is 3"),
+        ("towards_centre", TypeError, r"`ap_function` must be a function or its dotted name .*'towards_centre'"),
+        ("no_such_package.function", ValueError, r"`ap_function`: 'no_such_package.function' cannot be imported"),
+        ("toy.no_such_function", ValueError, r"`ap_function`: 'toy.no_such_function' cannot be imported"),
+        (".towards_centre", TypeError, r"`ap_function` must be a function or its dotted name .*'.towards_centre'"),
+        ("toy.", TypeError, r"`ap_function` must be a function or its dotted name .*'toy.'"),
+        ("toy.NOT_A_FUNCTION", TypeError, r"`ap_function`: 'toy.NOT_A_FUNCTION' names a int, but must name a function"),
+    ],
+)
+def test_resolve_says_what_was_expected(given, error, message):
+    with pytest.raises(error, match=message):
+        resolve(given, "ap_function")
+
+
+OBS = np.array([[1.0, 0.0], [1.0, 0.0]])
+NEXT = np.array([[0.9, 0.0], [1.1, 0.0]])
+ACTIONS = np.array([[-1.0], [1.0]])
+
+
+def test_function_labels_are_returned_row_by_row():
+    np.testing.assert_array_equal(labels_from_function(toy.towards_centre, OBS, ACTIONS, NEXT), [True, False])
+
+
+def raises(obs, actions, next_obs):
+    raise IndexError("no such column")
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "message"),
+    [
+        (
+            raises,
+            RuntimeError,
+            "`ap_function` raises raised IndexError: no such column. It is called with batches (obs, actions, "
+            "next_obs) of n = 2 rows; here the actions have shape (2, 1).",
+        ),
+        (lambda o, a, n: np.array([1, 0]), TypeError, "returned values of type int64, but must return bool"),
+        (lambda o, a, n: np.array([1.0, 0.0]), TypeError, "returned values of type float64, but must return bool"),
+        (lambda o, a, n: np.array([np.nan, 1.0]), TypeError, "returned NaN, but must return bool"),
+        (lambda o, a, n: True, ValueError, "returned an array of shape () for 2 actions, but must return shape (2,)"),
+        (
+            lambda o, a, n: a > 0,
+            ValueError,
+            "returned an array of shape (2, 1) for 2 actions, but must return shape (2,)",
+        ),
+        (lambda o, a, n: np.array([True]), ValueError, "returned an array of shape (1,) for 2 actions"),
+    ],
+)
+def test_function_that_returns_no_labels_is_named(function, error, message):
+    with pytest.raises(error, match=re.escape(message)):
+        labels_from_function(function, OBS, ACTIONS, NEXT)
+
+
+def test_info_labels_are_collected_in_the_order_of_the_environments():
+    labels = labels_from_infos([{"permissible": True}, {"permissible": np.False_}])
+    np.testing.assert_array_equal(labels, [True, False])
+    assert labels.dtype == bool
+
+
+def test_info_without_a_label_names_both_ways_out():
+    with pytest.raises(ValueError, match=r"There is no AP function.*`ap_function=`.*ActionPermissibility"):
+        labels_from_infos([{"permissible": True}, {}])
+
+
+@pytest.mark.parametrize("label", [1, float("nan"), None, np.array([True])])
+def test_info_label_must_be_bool(label):
+    with pytest.raises(TypeError, match=r'`info\["permissible"\]` must be a bool, but is'):
+        labels_from_infos([{"permissible": label}])

@@ -1,0 +1,149 @@
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
+from torch import nn
+
+from sb3_sap import PermissibilityPredictor
+from sb3_sap.knowledge import LabelledActions
+
+OBS, ACTIONS = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
+
+
+def predictor(**settings):
+    with th.random.fork_rng():
+        th.manual_seed(0)
+        return PermissibilityPredictor(OBS, ACTIONS, **settings)
+
+
+def dataset(obs, actions, labels):
+    return LabelledActions(np.float32(obs), np.float32(actions), np.float32(labels))
+
+
+def test_one_sgd_step_is_equation_7_by_hand():
+    # Without hidden layers E is σ(w·x + b) and, from zero weights, σ = 1/2: the gradient of the mean cross-entropy
+    # is the mean of (1/2 - label)·x.
+    e = predictor(net_arch=[], learning_rate=1.0, weight_decay=0.5, optimizer_class="SGD")
+    with th.no_grad():
+        e.head[0].weight.zero_()
+        e.head[0].bias.zero_()
+    data = dataset([[1, 0], [0, 1]], [[1], [-1]], [1, 0])
+    # x = (1, 0, 1) labelled 1: -1/2 x; x = (0, 1, -1) labelled 0: +1/2 x; their mean is (-1/4, 1/4, -1/2), bias 0.
+    assert e.fit(data) == pytest.approx(np.log(2))
+    np.testing.assert_allclose(e.head[0].weight.detach()[0], [0.25, -0.25, 0.5], atol=1e-6)
+    assert e.head[0].bias.item() == pytest.approx(0)
+
+
+def test_the_step_adds_lambda_theta_to_the_gradient_of_the_cross_entropy():
+    rate, decay = 0.1, 0.3
+    e = predictor(net_arch=[4], learning_rate=rate, weight_decay=decay, optimizer_class="SGD")
+    before = [p.detach().clone() for p in e.parameters()]
+    data = dataset([[0.5, -1], [0.2, 0.3], [1, 1]], [[0.1], [-0.7], [0.4]], [1, 0, 0])
+    x = th.cat([th.tensor(data.observations), th.tensor(data.actions)], dim=1)
+    probabilities = th.sigmoid(e.head(x))[:, 0]
+    label = th.tensor(data.labels)
+    cross_entropy = -(label * probabilities.log() + (1 - label) * (1 - probabilities).log()).mean()  # Eq. (7)
+    gradients = th.autograd.grad(cross_entropy, list(e.parameters()))
+    assert e.fit(data) == pytest.approx(cross_entropy.item(), rel=1e-5)
+    for old, gradient, new in zip(before, gradients, e.parameters(), strict=True):
+        th.testing.assert_close(new.detach(), old - rate * (gradient + decay * old))
+
+
+def test_fit_takes_every_mini_batch_once_and_returns_their_mean_loss():
+    e = predictor(net_arch=[], learning_rate=0.0, batch_size=4, optimizer_class="SGD")
+    assert not e.fitted
+    rows = np.arange(10)
+    data = dataset(np.stack([rows, -rows], 1) / 10, rows[:, None] / 10, rows % 2)
+    losses = [e.fit(LabelledActions(*(part[cut] for part in data))) for cut in (slice(4), slice(4, 8), slice(8, 10))]
+    assert int(e.n_updates) == 3
+    assert e.fit(data) == pytest.approx(np.mean(losses))
+    assert int(e.n_updates) == 6
+    assert e.fitted
+
+
+def threshold_data(rng, n):
+    """Permissible where the action is above the first observation; nothing within 0.1 of the border."""
+    obs, actions = rng.uniform(-1, 1, (n, 2)), rng.uniform(-1, 1, (n, 1))
+    clear = np.abs(actions[:, 0] - obs[:, 0]) > 0.1
+    return dataset(obs[clear], actions[clear], actions[clear, 0] > obs[clear, 0])
+
+
+@pytest.mark.parametrize("settings", [{}, {"optimizer_class": "SGD", "learning_rate": 0.1}])
+def test_learns_a_threshold_that_depends_on_the_state(settings):
+    rng = np.random.default_rng(0)
+    e = predictor(net_arch=[32], **settings)
+    unseen = threshold_data(rng, 500)
+    assert sum(e.recall(unseen)) < 1.6
+    for _ in range(100):
+        e.fit(threshold_data(rng, 512))
+    assert min(e.recall(unseen)) > 0.97
+
+
+def test_recall_by_hand():
+    e = predictor(net_arch=[])
+    with th.no_grad():  # logit = action: permissible above zero
+        e.head[0].weight.copy_(th.tensor([[0.0, 0.0, 1.0]]))
+        e.head[0].bias.zero_()
+    actions = [[0.5], [-0.5], [0.2], [0.1], [-0.1], [0.0]]
+    labels = [1, 1, 1, 0, 0, 0]  # right: yes, no, yes, no, yes, yes (a logit of 0 is not permissible)
+    assert e.recall(dataset(np.zeros((6, 2)), actions, labels)) == (pytest.approx(2 / 3), pytest.approx(2 / 3))
+    assert e.recall(dataset(np.zeros((5, 2)), actions[:5], labels[:5])) == (pytest.approx(1 / 2), pytest.approx(2 / 3))
+
+
+def test_the_paper_network_is_the_default():
+    shapes = [tuple(layer.weight.shape) for layer in predictor().head if isinstance(layer, nn.Linear)]
+    assert shapes == [(128, 3), (256, 128), (1, 256)]
+
+
+@pytest.mark.parametrize("name", ["SGD", "Adam", "AdamW", "RMSprop"])
+def test_optimizers_by_name_and_class(name):
+    for given in (name, getattr(th.optim, name)):
+        optimizer = predictor(optimizer_class=given, learning_rate=0.01, weight_decay=0.02).optimizer
+        assert type(optimizer) is getattr(th.optim, name)
+        (group,) = optimizer.param_groups
+        assert (group["lr"], group["weight_decay"]) == (0.01, 0.02)
+
+
+def test_optimizer_kwargs_are_passed_on():
+    e = predictor(optimizer_class="SGD", optimizer_kwargs={"momentum": 0.9})
+    assert e.optimizer.param_groups[0]["momentum"] == 0.9
+
+
+@pytest.mark.parametrize("name", ["Adamm", "sgd", "lr_scheduler", "Tensor"])
+def test_unknown_optimizers_are_named(name):
+    with pytest.raises(ValueError, match=rf"`optimizer_class` = '{name}' names no optimizer of torch.optim"):
+        predictor(optimizer_class=name)
+
+
+def test_dict_observations():
+    space = spaces.Dict({"a": spaces.Box(-1, 1, (1,)), "b": spaces.Box(-1, 1, (2,))})
+    e = PermissibilityPredictor(space, ACTIONS, net_arch=[8], batch_size=2, features_extractor_class=CombinedExtractor)
+    obs = {"a": np.float32([[0.1], [0.2], [0.3]]), "b": np.float32([[1, 2], [3, 4], [5, 6]])}
+    data = LabelledActions(obs, np.float32([[1], [0], [-1]]), np.float32([1, 0, 1]))
+    x = th.tensor([[0.1, 1, 2, 1], [0.2, 3, 4, 0], [0.3, 5, 6, -1]])
+    logits = e({key: th.tensor(value) for key, value in obs.items()}, th.tensor(data.actions))
+    th.testing.assert_close(logits, e.head(x)[:, 0])
+    e.fit(data)
+    assert int(e.n_updates) == 2
+
+
+def test_images_are_scaled_and_have_an_extractor_of_their_own_that_learns():
+    space = spaces.Box(0, 255, (1, 36, 36), np.uint8)
+    e = PermissibilityPredictor(
+        space, ACTIONS, net_arch=[8], features_extractor_class=NatureCNN, features_extractor_kwargs={"features_dim": 4}
+    )
+    images = np.random.default_rng(0).integers(0, 256, (6, 1, 36, 36), dtype=np.uint8)
+    data = LabelledActions(images, np.zeros((6, 1), np.float32), np.float32([0, 1] * 3))
+    th.testing.assert_close(e.features(th.tensor(images)), e.features_extractor(th.tensor(images).float() / 255))
+    before = e.features_extractor.cnn[0].weight.detach().clone()
+    e.fit(data)
+    assert not th.equal(before, e.features_extractor.cnn[0].weight)
+
+
+def test_a_saved_state_knows_that_it_was_fitted():
+    e, fresh = predictor(net_arch=[4]), predictor(net_arch=[4])
+    e.fit(dataset([[0, 0]], [[0]], [1]))
+    assert not fresh.fitted
+    fresh.load_state_dict(e.state_dict())
+    assert fresh.fitted

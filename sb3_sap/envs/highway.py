@@ -68,6 +68,7 @@ class HighwaySimulator:
         self.track = get_track(track)
         self.length = self.track.length
         self.control_step = control_step
+        self.start = {"distance": 0.0, "track_pos": 0.0, "angle": 0.0}
         self.speed = speed
         self._sub_steps = math.ceil(control_step / (SUB_STEP * min(speed / SUB_STEP_SPEED, 1.0)))
         self.network = road_network(self.track)

@@ -68,6 +68,8 @@ class Simulator(Protocol):
     """m, one lap along the centre line."""
     control_step: float
     """s, between two actions."""
+    start: dict[str, float]
+    """Where the car starts unless told otherwise: the arguments of `reset`."""
 
     def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
         """Put the car on the road, as `CarState` says it, and return where it stands."""
@@ -170,7 +172,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Place the car and return the first observation, shape (5,), and ``info`` without "permissible"."""
         super().reset(seed=seed)
-        start = {"distance": 0.0, "track_pos": 0.0, "angle": 0.0}
+        start = dict(self.simulator.start)
         if self.random_start:
             start["distance"] = self.np_random.uniform(0.0, self.simulator.length)
             start["track_pos"] = self.np_random.uniform(-RANDOM_TRACK_POS, RANDOM_TRACK_POS)
@@ -187,12 +189,11 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Steer for one control step and return observation (5,), reward, terminated, truncated and ``info``."""
-        steering = float(np.asarray(action).item())
-        if math.isnan(steering):
-            raise ValueError("action must be a steering in [-1, 1], got NaN.")
+        action = np.asarray(action, dtype=np.float64).reshape(self.action_space.shape)
+        if np.isnan(action).any():
+            raise ValueError(f"action must lie in [-1, 1], got {action}, which holds NaN.")
         before, dt = self._state, self.simulator.control_step
-        self._steering = min(max(steering, -1.0), 1.0)
-        self._state = state = self.simulator.step(self._steering)
+        self._state = state = self._drive(np.clip(action, -1.0, 1.0))
         half = self.simulator.length / 2
         self._progress += (state.distance - before.distance + half) % (2 * half) - half  # across the start line too
         self._steps += 1
@@ -200,13 +201,24 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         self._still_steps = 0 if moving else self._still_steps + 1
 
         info = self._info()
-        info["permissible"] = not abs(state.track_pos) - abs(before.track_pos) > 0  # Eq. (6)
+        info["permissible"] = self._permissible(before, state)
         lost = info["off_track"] or math.cos(state.angle) < 0
         stands = self._still_steps >= round(STILL_TIME / dt)
         finished = self.laps is not None and info["lap_done"]
         if self.render_mode == "human":
             self.render()
-        return self._observation(), OFF_TRACK_REWARD if lost else reward(state), lost or stands, finished, info
+        earned = OFF_TRACK_REWARD if lost else self._reward(before, state)
+        return self._observation(), earned, lost or stands, finished, info
+
+    def _drive(self, action: NDArray[np.float64]) -> CarState:
+        self._steering = float(action[0])
+        return self.simulator.step(self._steering)
+
+    def _reward(self, before: CarState, state: CarState) -> float:
+        return reward(state)
+
+    def _permissible(self, before: CarState, state: CarState) -> bool:
+        return not abs(state.track_pos) - abs(before.track_pos) > 0  # Eq. (6)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the car on its track: an image (height, width, 3) for "rgb_array", a window for "human"."""

@@ -1,0 +1,1 @@
+"""The reference simulator: TORCS' own physics, in process."""

@@ -1,0 +1,112 @@
+"""Finding an installed TORCS, and saying what is missing before the libraries, which would only crash, are asked."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import platform
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+LIBRARIES = Path("usr/lib/x86_64-linux-gnu")
+DATA = Path("usr/share/games/torcs")
+MODULES = {"simu": LIBRARIES / "torcs/modules/simu/simuv2.so", "track": LIBRARIES / "torcs/modules/track/track.so"}
+SHARED = (
+    LIBRARIES / "torcs/lib/libtxml.so",
+    LIBRARIES / "torcs/lib/libtgf.so",
+    LIBRARIES / "torcs/lib/librobottools.so",
+    LIBRARIES / "libplibul.so.1",
+    LIBRARIES / "libplibsg.so.1",
+)
+"""In the order in which they must be loaded."""
+HOW_TO_INSTALL = "run `sb3-sap torcs install`, or `apt-get install torcs` on Debian, or set TORCS_ROOT to where it is"
+CHECKSUMS = {
+    MODULES["simu"]: "2b9ee883a6e28dd640e474b8ca36e8a7a6746fe47d61832c4a76a76e900c6f36",
+    MODULES["track"]: "71f856b0015b8243dc7e3cf2201ca55025b6b2b34521850d9109172440246e11",
+}
+"""SHA-256 of the binaries whose structure layout is known: Debian's torcs 1.3.7+dfsg-5+b2, amd64."""
+
+
+class TorcsNotFoundError(RuntimeError):
+    """TORCS is missing, damaged, or of a version or machine that this package cannot drive."""
+
+
+def user_root() -> Path:
+    """Where ``sb3-sap torcs install`` puts TORCS."""
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
+    return Path(data) / "sb3_sap" / "torcs"
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A TORCS that was found whole."""
+
+    root: Path
+
+    def tracks(self) -> dict[str, Path]:
+        """Every track's file by its directory name, such as ``"wheel-2"``."""
+        files = (self.root / DATA / "tracks").glob("*/*/*.xml")
+        return {path.stem: path for path in sorted(files) if path.stem == path.parent.name}
+
+    def cars(self) -> dict[str, Path]:
+        """Every car's file by its directory name, such as ``"car1-trb1"``."""
+        files = (self.root / DATA / "cars").glob("*/*.xml")
+        return {path.stem: path for path in sorted(files) if path.stem == path.parent.name}
+
+    def track(self, name: str) -> Path:
+        """The file of a track."""
+        return _one_of("track", name, self.tracks())
+
+    def car(self, name: str) -> Path:
+        """The file of a car."""
+        return _one_of("car", name, self.cars())
+
+    def category(self, name: str) -> Path:
+        """The file of a category of cars, which cars name."""
+        path = self.root / DATA / "categories" / f"{name}.xml"
+        if not path.is_file():
+            raise TorcsNotFoundError(f"TORCS under {self.root} lacks {path.name}, the car's category: {HOW_TO_INSTALL}.")
+        return path
+
+
+def find_installation() -> Installation:
+    """The TORCS of ``TORCS_ROOT`` if it is set, else of the user's data folder, else of the system.
+
+    :raise TorcsNotFoundError: if there is none that can be used, saying why
+    """
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        raise TorcsNotFoundError(
+            f"TORCS' physics runs in process on Linux on x86_64 alone, but this is {sys.platform} on "
+            f"{platform.machine()}: use sap/LaneKeeping-v0, the embedded simulator."
+        )
+    named = os.environ.get("TORCS_ROOT")
+    for root in [Path(named)] if named else [user_root(), Path("/")]:
+        if (root / MODULES["simu"]).is_file():
+            return check_installation(root)
+    where = f"TORCS_ROOT={named}" if named else f"{user_root()} and the system"
+    raise TorcsNotFoundError(f"There is no TORCS in {where}: {HOW_TO_INSTALL}.")
+
+
+def check_installation(root: Path) -> Installation:
+    """Checks that everything is there and that the physics is the binary whose layout is known."""
+    import hashlib
+
+    for path in (*SHARED, *MODULES.values(), DATA / "tracks", DATA / "cars", DATA / "categories"):
+        if not (root / path).exists():
+            raise TorcsNotFoundError(f"TORCS under {root} is not whole, {path} is missing: {HOW_TO_INSTALL}.")
+    for path, expected in CHECKSUMS.items():
+        if hashlib.sha256((root / path).read_bytes()).hexdigest() != expected:
+            raise TorcsNotFoundError(
+                f"{root / path} is not the one of Debian's torcs 1.3.7+dfsg-5+b2 for amd64, whose structures this package "
+                f"knows; another would crash the process: {HOW_TO_INSTALL}."
+            )
+    return Installation(root)
+
+
+def _one_of(kind: str, name: str, known: dict[str, Path]) -> Path:
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(known)}."
+        raise ValueError(f"{kind} must be one that TORCS ships, got {name!r}; {hint}")
+    return known[name]

@@ -1,0 +1,91 @@
+"""Loading TORCS' libraries, and a private copy of the simulator and the track builder for each simulation."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import tempfile
+import threading
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from sb3_sap.envs.torcs.installation import MODULES, SHARED, Installation
+from sb3_sap.envs.torcs.structures import LocalPosition
+
+_Position = ctypes.POINTER(LocalPosition)
+_Float = ctypes.POINTER(ctypes.c_float)
+READ_STANDARD = 1
+"""GfParmReadFile: read the file as it is."""
+MERGE_ALL = 15
+"""GfParmMergeHandles: sources and parameters of both, the handles released."""
+
+
+class Shared:
+    """The functions of the libraries that every simulation of a process shares."""
+
+    def __init__(self, root: Path):
+        loaded = [ctypes.CDLL(str(root / path), mode=ctypes.RTLD_GLOBAL | os.RTLD_LAZY) for path in SHARED]
+        _, tgf, tools, *_ = loaded
+        string, pointer = ctypes.c_char_p, ctypes.c_void_p
+        self.read_parameters = _function(tgf, "_Z14GfParmReadFilePKci", pointer, string, ctypes.c_int)
+        self.merge = _function(tgf, "_Z18GfParmMergeHandlesPvS_i", pointer, pointer, pointer, ctypes.c_int)
+        self.get_string = _function(tgf, "_Z12GfParmGetStrPvPKcS1_S1_", string, pointer, string, string, string)
+        self.to_global = _function(
+            tools, "_Z19RtTrackLocal2GlobalP10tTrkLocPosPfS1_i", None, _Position, _Float, _Float, ctypes.c_int
+        )
+        self.height = _function(tools, "_Z14RtTrackHeightLP10tTrkLocPos", ctypes.c_float, _Position)
+        self.heading = _function(tools, "_Z19RtTrackSideTgAngleLP10tTrkLocPos", ctypes.c_float, _Position)
+        _function(tgf, "_Z10GfParmInitv", None)()
+
+
+class Private:
+    """One copy of the two libraries whose simulator and track are global variables."""
+
+    def __init__(self, root: Path):
+        pointer = ctypes.c_void_p
+        with tempfile.TemporaryDirectory(prefix="sb3-sap-torcs-") as folder:
+            # Another path is another library to the loader; the file may go once it is mapped.
+            simu, track = (
+                ctypes.CDLL(shutil.copy(root / path, folder), mode=os.RTLD_LOCAL | os.RTLD_LAZY)
+                for path in MODULES.values()
+            )
+        self.init = _function(simu, "_Z7SimInitiP6tTrackff", None, ctypes.c_int, pointer, ctypes.c_float, ctypes.c_float)
+        self.configure = _function(simu, "_Z9SimConfigP6CarEltP6RmInfo", None, pointer, pointer)
+        self.update = _function(simu, "_Z9SimUpdateP9Situationdi", None, pointer, ctypes.c_double, ctypes.c_int)
+        self.shutdown = _function(simu, "_Z11SimShutdownv", None)
+        self.build_track = _function(track, "_Z12TrackBuildv1Pc", pointer, ctypes.c_char_p)
+        self.close_track = _function(track, "_Z13TrackShutdownv", None)
+
+
+class LibraryPool:
+    """Hands out private copies and takes them back, so that many environments, one after the other, need only one."""
+
+    def __init__(self, installation: Installation):
+        self.root = installation.root
+        self.shared = Shared(self.root)
+        self._free: list[Private] = []
+        self._lock = threading.Lock()
+
+    def acquire(self) -> Private:
+        """A copy that nobody else uses."""
+        with self._lock:
+            return self._free.pop() if self._free else Private(self.root)
+
+    def release(self, library: Private) -> None:
+        """Returns a copy whose simulator and track have been shut down."""
+        with self._lock:
+            self._free.append(library)
+
+
+@cache
+def pool(installation: Installation) -> LibraryPool:
+    """The pool of this process."""
+    return LibraryPool(installation)
+
+
+def _function(library: ctypes.CDLL, symbol: str, result: Any, *arguments: Any) -> Any:
+    function = library[symbol]
+    function.restype, function.argtypes = result, list(arguments)
+    return function

@@ -1,0 +1,255 @@
+"""TORCS' physics of one car on one track, inside this process: place the car, control it, advance it tick by tick."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import tempfile
+from bisect import bisect_right
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_sap.envs.torcs.installation import Installation, find_installation
+from sb3_sap.envs.torcs.libraries import MERGE_ALL, READ_STANDARD, pool
+from sb3_sap.envs.torcs.structures import (
+    PLACED,
+    RUNNING,
+    STRAIGHT,
+    CarStructure,
+    RaceStructure,
+    SituationStructure,
+    TrackSegment,
+    TrackStructure,
+)
+from sb3_sap.envs.torcs.track_files import flatten
+
+TICK = 0.002
+"""s, one step of the physics."""
+DROP_HEIGHT = 0.2
+"""m above the road at which a car is placed."""
+SETTLE_TICKS = 500
+"""The race engine lets the car come to rest with the brake on, for one second."""
+MAX_DAMAGE = 10_000
+SKILL_LEVELS = range(4)
+"""0 rookie to 3 pro; the level changes the grip of the tyres."""
+
+
+class Segment(NamedTuple):
+    """A segment of the road, as TORCS built it."""
+
+    address: int
+    type: int
+    from_start: float  # m
+    radius: float  # m, 0 on straights
+    width: float  # m
+
+
+class Simulation:
+    """One car on one track.
+
+    :param track: name of a track that TORCS ships, or the path of a track file
+    :param car: name of a car that TORCS ships
+    :param skill_level: 0 (rookie) to 3 (pro)
+    :param fuel_factor: fuel used, relative to the car's own; 0 keeps it the same on every lap
+    :param damage_factor: damage taken, relative to TORCS' own
+    :param installation: TORCS; None: the one that is found
+    :raise TorcsNotFoundError: if there is no TORCS that can be used
+    :raise ValueError: for a track, a car or a level that does not exist, or a damaged track file
+    """
+
+    def __init__(
+        self,
+        track: str | Path = "wheel-2",
+        car: str = "car1-trb1",
+        skill_level: int = 0,
+        fuel_factor: float = 0.0,
+        damage_factor: float = 0.0,
+        installation: Installation | None = None,
+    ):
+        installation = installation or find_installation()
+        if skill_level not in SKILL_LEVELS:
+            raise ValueError(f"skill_level must be from 0 (rookie) to 3 (pro), got {skill_level!r}.")
+        path = Path(track)
+        self.track_path = path if path.suffix == ".xml" and path.is_file() else installation.track(str(track))
+        track_file = flatten(self.track_path)
+        car_file = installation.car(car)
+        self._factors = float(fuel_factor), float(damage_factor)
+        self._skill_level = skill_level
+        self._pool = pool(installation)
+        self._shared = self._pool.shared
+        self._car_handle = self._read_car(car_file, installation)
+        self._library: Any = self._pool.acquire()
+        self._running = False
+        with tempfile.NamedTemporaryFile(suffix=".xml") as file:
+            file.write(track_file)
+            file.flush()
+            address = self._library.build_track(file.name.encode())
+        self._track = TrackStructure.from_address(address)
+        self.length: float = self._track.length
+        self.segments = self._read_segments()
+        self._segment_at = {segment.address: segment for segment in self.segments}
+        self._starts = [segment.from_start for segment in self.segments]
+        self._make_structures()
+
+    def _read_car(self, car_file: Path, installation: Installation) -> Any:
+        handle = self._shared.read_parameters(str(car_file).encode(), READ_STANDARD)
+        if not handle:
+            raise ValueError(f"{car_file} is not a readable TORCS car file: install TORCS' data again.")
+        category = self._shared.get_string(handle, b"Car", b"category", b"").decode()
+        category_handle = self._shared.read_parameters(str(installation.category(category)).encode(), READ_STANDARD)
+        return self._shared.merge(category_handle, handle, MERGE_ALL)
+
+    def _read_segments(self) -> list[Segment]:
+        segments = []
+        address = TrackSegment.from_address(self._track.last_segment).next
+        for _ in range(self._track.n_segments):
+            found = TrackSegment.from_address(address)
+            radius = 0.0 if found.type == STRAIGHT else found.radius
+            segments.append(Segment(address, found.type, found.from_start, radius, found.width))
+            address = found.next
+        return segments
+
+    def _make_structures(self) -> None:
+        self.car: Any = CarStructure()
+        self._position: Any = self.car.position
+        self._situation: Any = SituationStructure()
+        self._race: Any = RaceStructure()
+        self._cars = (ctypes.c_void_p * 1)(ctypes.addressof(self.car))
+        self._situation.n_cars = 1
+        self._situation.delta_time = TICK
+        self._situation.max_damage = MAX_DAMAGE
+        self._situation.cars = ctypes.addressof(self._cars)
+        self._race.car_list = ctypes.addressof(self.car)
+        self._race.situation = ctypes.addressof(self._situation)
+        self._race.track = ctypes.addressof(self._track)
+        self._pose, self._velocity = self.car.pose, self.car.velocity
+        self._wheels = list(self.car.wheels)
+        self._at = ctypes.byref(self._position)
+
+    def place(self, distance: float, track_pos: float = 0.0, angle: float = 0.0, height: float = DROP_HEIGHT) -> None:
+        """Puts the car, at rest, on the road and lets it settle.
+
+        :param distance: m along the centre line from the start line
+        :param track_pos: +1 is the left edge
+        :param angle: rad, road heading minus yaw
+        :param height: m above the road from which it is dropped
+        """
+        self._check_open()
+        segment = self.segments[max(bisect_right(self._starts, distance % self.length) - 1, 0)]
+        to_start = distance % self.length - segment.from_start
+        if self._running:
+            self._library.shutdown()
+        ctypes.memset(ctypes.addressof(self.car), 0, ctypes.sizeof(self.car))
+        self.car.skill_level, self.car.car_handle = self._skill_level, self._car_handle
+        position = self._position
+        position.segment = segment.address
+        position.to_start = to_start if segment.type == STRAIGHT else to_start / segment.radius
+        position.to_middle = track_pos * segment.width / 2
+        position.to_right = segment.width / 2 + position.to_middle
+        position.to_left = segment.width - position.to_right
+        x, y = ctypes.c_float(), ctypes.c_float()
+        self._shared.to_global(self._at, ctypes.byref(x), ctypes.byref(y), 0)
+        self._pose[0], self._pose[1] = x.value, y.value
+        self._pose[2] = self._shared.height(self._at) + height
+        self._pose[5] = (self.heading - angle) % (2 * math.pi)
+        self._situation.race_state, self._situation.current_time = PLACED, 0.0
+        self._library.init(1, ctypes.addressof(self._track), *self._factors)
+        self._running = True
+        self._library.configure(ctypes.addressof(self.car), ctypes.addressof(self._race))
+        self.advance(1, PLACED)
+        self.car.brake = 1.0
+        self.advance(SETTLE_TICKS, PLACED)
+
+    def control(self, steer: float, accelerator: float, brake: float = 0.0, clutch: float = 0.0, gear: int = 1) -> None:
+        """Sets the controls; they hold until set again, but for the throttle, which a shift cuts.
+
+        :param steer: -1 (right) to 1 (left)
+        :param accelerator: 0 to 1
+        :param brake: 0 to 1
+        :param clutch: 0 to 1
+        :param gear: -1 (reverse) to the highest
+        """
+        car = self.car
+        car.steer, car.accelerator, car.brake, car.clutch, car.gear_command = steer, accelerator, brake, clutch, gear
+
+    def advance(self, ticks: int, race_state: int = RUNNING) -> None:
+        """Advances the physics by a number of ticks of 2 ms."""
+        if not self._running:
+            raise RuntimeError("The car stands on no road yet, or the simulation is closed: call `place` first.")
+        self._situation.race_state = race_state
+        update, situation = self._library.update, ctypes.addressof(self._situation)
+        for _ in range(ticks):
+            update(situation, TICK, -1)
+
+    @property
+    def velocity(self) -> tuple[float, float, float]:
+        """In the car's frame, m/s."""
+        velocity = self._velocity
+        return velocity[0], velocity[1], velocity[2]
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """x and y of the centre of gravity [m] and yaw [rad], in the track's frame."""
+        return self._pose[0], self._pose[1], self._pose[5]
+
+    @property
+    def heading(self) -> float:
+        """Heading of the road where the car is, rad."""
+        return self._shared.heading(self._at)  # type: ignore[no-any-return]
+
+    @property
+    def angle(self) -> float:
+        """Road heading minus yaw, rad in [-π, π]."""
+        return math.remainder(self.heading - self._pose[5], 2 * math.pi)
+
+    @property
+    def track_pos(self) -> float:
+        """Distance to the left of the centre line, in half widths."""
+        return 2 * self._position.to_middle / self._segment.width  # type: ignore[no-any-return]
+
+    @property
+    def distance(self) -> float:
+        """m along the centre line from the start line, in [0, length)."""
+        segment, to_start = self._segment, self._position.to_start
+        along = segment.from_start + (to_start if segment.type == STRAIGHT else to_start * segment.radius)
+        return along % self.length  # type: ignore[no-any-return]
+
+    @property
+    def wheel_spins(self) -> tuple[float, float, float, float]:
+        """Spin of the wheels, rad/s: front right, front left, rear right, rear left."""
+        front_right, front_left, rear_right, rear_left = self._wheels
+        return front_right.spin, front_left.spin, rear_right.spin, rear_left.spin
+
+    @property
+    def engine_speed(self) -> float:
+        """rad/s."""
+        return self.car.engine_speed  # type: ignore[no-any-return]
+
+    @property
+    def gear(self) -> int:
+        """The engaged gear."""
+        return self.car.gear  # type: ignore[no-any-return]
+
+    @property
+    def damage(self) -> int:
+        """Damage points."""
+        return self.car.damage  # type: ignore[no-any-return]
+
+    @property
+    def _segment(self) -> Segment:
+        return self._segment_at[self._position.segment]
+
+    def close(self) -> None:
+        """Gives the libraries back; the simulation can no longer be used."""
+        library, self._library = self._library, None
+        if library is None:
+            return
+        if self._running:
+            library.shutdown()
+            self._running = False
+        library.close_track()
+        self._pool.release(library)
+
+    def _check_open(self) -> None:
+        if self._library is None:
+            raise RuntimeError("The simulation is closed: make a new one.")

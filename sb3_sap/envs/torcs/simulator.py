@@ -1,0 +1,93 @@
+"""TORCS behind the lane-keeping task (`sb3_sap.envs.lane_keeping.Simulator`)."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from sb3_sap.envs.lane_keeping import CarState
+from sb3_sap.envs.torcs.simulation import TICK, Simulation
+from sb3_sap.envs.torcs.throttle import KMH, PERIOD_TICKS, SpeedHolder
+from sb3_sap.envs.torcs.track_files import flatten
+from sb3_sap.envs.tracks import read_track_xml
+
+TRAINING_DISTANCE = 100.0
+"""m before the start line, where the training start is."""
+STARTS = ("training", "race")
+
+
+class TorcsSimulator:
+    """One car of TORCS, held at its default speed.
+
+    :param track: name of a track that TORCS ships, or the path of a track file
+    :param speed: default speed, km/h
+    :param control_step: s between two actions, a multiple of 0.002
+    :param car: name of a car that TORCS ships
+    :param start: "training": 100 m before the line, on the axis; "race": the engine's own grid
+    :raise ValueError: for what TORCS does not have or cannot do
+    """
+
+    def __init__(
+        self,
+        track: str | Path = "wheel-2",
+        speed: float = 50.0,
+        control_step: float = 0.2,
+        car: str = "car1-trb1",
+        start: str = "training",
+    ):
+        if start not in STARTS:
+            raise ValueError(f"start must be one of {', '.join(map(repr, STARTS))}, got {start!r}.")
+        if not 0 < speed <= 300:
+            raise ValueError(f"speed must lie above 0 and not above 300 km/h, got {speed!r}.")
+        ticks = round(control_step / TICK)
+        if ticks < 1 or abs(ticks * TICK - control_step) > 1e-9:
+            raise ValueError(f"control_step must be a positive multiple of {TICK} s, got {control_step!r}.")
+        self.simulation = Simulation(track, car)
+        self.control_step = control_step
+        self.length = self.simulation.length
+        self.track = read_track_xml(self.simulation.track_path)
+        self.start = {"distance": self.length - TRAINING_DISTANCE, "track_pos": 0.0, "angle": 0.0}
+        if start == "race":
+            self.start |= race_grid(self.simulation.track_path, self.length)
+        whole, rest = divmod(ticks, PERIOD_TICKS)
+        self._periods = [PERIOD_TICKS] * whole + ([rest] if rest else [])
+        self._throttle = SpeedHolder(speed)
+
+    def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
+        """Put the car, at rest, on the road."""
+        self.simulation.place(distance, track_pos, angle)
+        self._throttle.reset()
+        return self._state()
+
+    def step(self, steering: float) -> CarState:
+        """Drive one control step, the throttle decided anew every 0.02 s."""
+        simulation, throttle = self.simulation, self._throttle
+        for ticks in self._periods:
+            accelerator, brake, gear = throttle.controls(simulation)
+            simulation.control(steering, accelerator, brake, gear=gear)
+            simulation.advance(ticks)
+        return self._state()
+
+    def close(self) -> None:
+        """Give TORCS' libraries back."""
+        self.simulation.close()
+
+    def _state(self) -> CarState:
+        simulation = self.simulation
+        x, y, z = simulation.velocity
+        return CarState(
+            simulation.angle, simulation.track_pos, x * KMH, y * KMH, z * KMH, simulation.distance
+        )
+
+
+def race_grid(path: Path, length: float) -> dict[str, float]:
+    """The first place of the race engine's grid: as the track's own "Starting Grid" says, else 100 m before the line."""
+    root = ElementTree.fromstring(flatten(path))
+    grid = root.find("section[@name='Starting Grid']")
+    found = {} if grid is None else {item.get("name"): item.get("val", "") for item in grid}
+    rows = max(int(float(found.get("rows", 1))), 1)
+    distance = float(found.get("distance to start", TRAINING_DISTANCE))
+    # The places of a row divide the width evenly; the pole position is the one nearest its side.
+    offset = (rows - 1) / (rows + 1)
+    side = 1 if found.get("pole position side", "right") == "left" else -1
+    return {"distance": length - distance, "track_pos": side * offset}

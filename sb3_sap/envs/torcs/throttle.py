@@ -1,0 +1,63 @@
+"""Holding the default speed (section 5.1): the throttle, the brake and the gears that the paper's agent does not control."""
+
+from __future__ import annotations
+
+from sb3_sap.envs.torcs.simulation import Simulation
+
+PERIOD_TICKS = 10
+"""Ticks between two decisions, 50 Hz; the gearbox cuts the throttle while it shifts, so the controls are written anew."""
+GAIN = 0.08
+"""Throttle per km/h below the target."""
+INTEGRAL_GAIN = 0.02
+"""Throttle per km/h and second below it."""
+BRAKE_MARGIN = 3.0
+"""km/h above the target from which the brake helps …"""
+BRAKE_GAIN = 0.05
+"""… by so much per km/h."""
+SLIP = 5.0
+"""rad/s. While the rear wheels together spin so much faster than the front wheels, the throttle is halved."""
+SHIFT_UP, SHIFT_DOWN = 800.0, 350.0
+"""rad/s, engine speeds at which the gear changes …"""
+SHIFT_TIME = 0.5
+"""… and s for which it then stays."""
+PERIOD = 0.02
+"""s"""
+KMH = 3.6
+
+
+class SpeedHolder:
+    """A proportional-integral throttle and an automatic gearbox.
+
+    :param speed: target, km/h
+    """
+
+    def __init__(self, speed: float):
+        self.speed = speed
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the last drive."""
+        self._integral = 0.0  # throttle
+        self._gear = 1
+        self._since_shift = SHIFT_TIME
+
+    def controls(self, simulation: Simulation) -> tuple[float, float, int]:
+        """Throttle, brake and gear for the next period."""
+        lack = self.speed - simulation.velocity[0] * KMH
+        if abs(lack) < self.speed / 5:  # while it accelerates from rest, nothing is learned about the throttle needed
+            self._integral = min(max(self._integral + INTEGRAL_GAIN * PERIOD * lack, 0.0), 1.0)
+        throttle = min(max(GAIN * lack + self._integral, 0.0), 1.0)
+        front_right, front_left, rear_right, rear_left = simulation.wheel_spins
+        if rear_right + rear_left - front_right - front_left > SLIP:
+            throttle /= 2
+        brake = min(max(BRAKE_GAIN * (-lack - BRAKE_MARGIN), 0.0), 1.0)
+        return throttle, brake, self._shift(simulation.engine_speed)
+
+    def _shift(self, engine_speed: float) -> int:
+        self._since_shift += PERIOD
+        if self._since_shift >= SHIFT_TIME:
+            step = (engine_speed > SHIFT_UP and self._gear < 6) - (engine_speed < SHIFT_DOWN and self._gear > 1)
+            if step:
+                self._gear += step
+                self._since_shift = 0.0
+        return self._gear

@@ -1,0 +1,52 @@
+"""Making TORCS' track files safe to read for its own parser.
+
+They claim UTF-8 but hold Latin-1 bytes and pull in other files as external entities. Under a Python that is linked to the
+system's expat, that parser refuses the objects' file and the track library then crashes. So it is handed a clean copy:
+ASCII, the surfaces inlined, the objects, which the physics does not need, left out.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from sb3_sap.envs.tracks import read_track_xml
+
+ENTITY = re.compile(r'<!ENTITY\s+([\w.-]+)\s+SYSTEM\s+"([^"]*)"\s*>')
+PROLOG = re.compile(r"<\?xml.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*(\[.*?\]\s*)?>", re.DOTALL)
+KEPT_ENTITY = "default-surfaces"
+
+
+def flatten(path: Path) -> bytes:
+    """The track file as one clean XML document.
+
+    :raise ValueError: if it is not a track file that TORCS could build, saying what is wrong
+    """
+    read_track_xml(path)  # says what is missing of the plan; TORCS would crash
+    text = _read(path)
+    for name, target in ENTITY.findall(text):
+        inlined = path.parent / target
+        if name == KEPT_ENTITY and not inlined.is_file():
+            raise ValueError(f"{path} needs {inlined}, the road surfaces, which is missing: install TORCS' data again.")
+        replacement = PROLOG.sub("", _read(inlined)) if name == KEPT_ENTITY else ""
+        text = text.replace(f"&{name};", replacement)
+    try:
+        root = ElementTree.fromstring(PROLOG.sub("", text).strip())
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path} is not a readable TORCS track file: {error}.") from error
+    _check_surfaces(root, path)
+    return ElementTree.tostring(root, encoding="us-ascii", xml_declaration=True)
+
+
+def _read(path: Path) -> str:
+    return path.read_bytes().decode("latin-1")
+
+
+def _check_surfaces(root: ElementTree.Element, path: Path) -> None:
+    """Every surface that the road names must be defined: the library dereferences what it does not find."""
+    defined = {section.get("name") for section in root.findall("section[@name='Surfaces']/section")}
+    for element in root.find("section[@name='Main Track']").iter("attstr"):  # type: ignore[union-attr]
+        name = element.get("name", "")
+        if name.endswith("surface") and element.get("val") not in defined:
+            raise ValueError(f"{path}: {name} is {element.get('val')!r}, a surface that the file does not define.")

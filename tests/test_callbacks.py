@@ -157,6 +157,16 @@ def test_one_of_the_users_own_takes_the_place_of_the_default(wrap, progress_bar,
     assert callback.fits[-10:] == list(range(21, 31))
 
 
+def test_a_subclass_may_use_the_step_hook_for_itself():
+    class Mine(Recorder):
+        def _on_step(self):
+            return self.num_timesteps < 30
+
+    callback = Mine()
+    assert build(DDPGAP).learn(100, callback=callback).num_timesteps == 30
+    assert callback.fits[-9:] == list(range(21, 30))  # SB3 ends no rollout that a callback stops
+
+
 @pytest.mark.parametrize(
     "wrap",
     [

@@ -139,6 +139,7 @@ def test_the_model_installs_the_callback_by_itself(given, algorithm, monkeypatch
     assert fits[-10:] == list(range(91, 101))
 
 
+@pytest.mark.filterwarnings("ignore::tqdm.TqdmExperimentalWarning")
 @pytest.mark.parametrize("progress_bar", [False, True])
 @pytest.mark.parametrize(
     "wrap",

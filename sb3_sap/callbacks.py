@@ -29,7 +29,7 @@ class PermissibilityCallback(BaseCallback):
 
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
-        self._steps = 0
+        self._start = 0  # time step at which the rollout began
         self._seen: tuple[int, ...] = (0, 0)
         self._warned = False
 
@@ -39,11 +39,10 @@ class PermissibilityCallback(BaseCallback):
         return cast(KnowledgeMixin, self.model.replay_buffer).knowledge
 
     def _on_rollout_start(self) -> None:
-        self._steps = 0
+        self._start = self.model.num_timesteps
         self._seen = tuple(self.knowledge.seen)
 
     def _on_step(self) -> bool:
-        self._steps += 1
         return True
 
     def _on_rollout_end(self) -> None:
@@ -52,7 +51,7 @@ class PermissibilityCallback(BaseCallback):
         new = np.subtract(knowledge.seen, self._seen)
         self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
         if min(knowledge.counts("train")) >= self.model.min_per_class:
-            for _ in range(self._steps):
+            for _ in range((self.model.num_timesteps - self._start) // self.model.n_envs):
                 self.fit()
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)

@@ -46,8 +46,9 @@ class SettingsMixin(OffPolicyAlgorithm):
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             check_action_space(type(self).__name__, env.action_space)
-        # SB3 writes into the dictionary that it is given.
-        kwargs["policy_kwargs"] = dict(kwargs.get("policy_kwargs") or {})
+        # SB3 writes into the dictionaries that it is given.
+        for name in ("policy_kwargs", "replay_buffer_kwargs"):
+            kwargs[name] = dict(kwargs.get(name) or {})
         super().__init__(policy, env, *args, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any):

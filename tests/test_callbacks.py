@@ -139,6 +139,7 @@ def test_the_model_installs_the_callback_by_itself(given, algorithm, monkeypatch
     assert fits[-10:] == list(range(91, 101))
 
 
+@pytest.mark.filterwarnings("ignore::tqdm.TqdmExperimentalWarning")
 @pytest.mark.parametrize("progress_bar", [False, True])
 @pytest.mark.parametrize(
     "wrap",
@@ -155,6 +156,16 @@ def test_one_of_the_users_own_takes_the_place_of_the_default(wrap, progress_bar,
     build(DDPGAP).learn(30, callback=wrap(callback), progress_bar=progress_bar)
     assert fits == []
     assert callback.fits[-10:] == list(range(21, 31))
+
+
+def test_a_subclass_may_use_the_step_hook_for_itself():
+    class Mine(Recorder):
+        def _on_step(self):
+            return self.num_timesteps < 30
+
+    callback = Mine()
+    assert build(DDPGAP).learn(100, callback=callback).num_timesteps == 30
+    assert callback.fits[-9:] == list(range(21, 30))  # SB3 ends no rollout that a callback stops
 
 
 @pytest.mark.parametrize(

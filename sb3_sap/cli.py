@@ -9,20 +9,22 @@ from pathlib import Path
 from rich.console import Console
 
 from sb3_sap import __version__
+from sb3_sap.envs.torcs.cli import add_torcs
+from sb3_sap.evaluation import ENVIRONMENTS
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code; what the user got wrong is told in one sentence."""
     options = parser().parse_args(arguments)
     try:
-        options.run(options, Console())
+        code: int = options.run(options, Console())
     except KeyboardInterrupt:
         print("sb3-sap: interrupted; what was written so far is kept.", file=sys.stderr)
         return 130
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, RuntimeError) as error:
         print(f"sb3-sap: error: {error}", file=sys.stderr)
         return 1
-    return 0
+    return code
 
 
 def parser() -> argparse.ArgumentParser:
@@ -32,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     commands = root.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_demo(commands)
     _add_evaluate(commands)
+    add_torcs(commands)
     return root
 
 
@@ -52,15 +55,17 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     command.add_argument("--steps", type=_positive, default=default.steps, help="training steps")
     command.add_argument("--seed", type=int, default=default.seed, help="seed of everything random")
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
+    _add_simulator(command)
     command.add_argument("--out", type=Path, default=default.out, help="output folder")
     command.add_argument("--no-animation", dest="animation", action="store_false", help="leave out lap.gif")
     command.set_defaults(run=_demo)
 
 
-def _demo(options: argparse.Namespace, console: Console) -> None:
+def _demo(options: argparse.Namespace, console: Console) -> int:
     from sb3_sap.demo import Run, demo
 
     demo(Run(**{name: value for name, value in vars(options).items() if name != "run"}), console)
+    return 0
 
 
 def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -76,10 +81,11 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     command.add_argument("model", type=Path, help="the .zip file of any SB3 model of the lane-keeping task")
     command.add_argument("--tracks", nargs="+", default=list(TEST_TRACKS), metavar="TRACK", help="tracks to drive")
     command.add_argument("--json", type=Path, help="where to write the results; evaluation.json beside the model")
-    command.set_defaults(run=_evaluate, simulator="highway")
+    _add_simulator(command)
+    command.set_defaults(run=_evaluate)
 
 
-def _evaluate(options: argparse.Namespace, console: Console) -> None:
+def _evaluate(options: argparse.Namespace, console: Console) -> int:
     from sb3_sap.demo import drive_tracks, results_table
     from sb3_sap.evaluation import load_policy, write_results
 
@@ -87,6 +93,11 @@ def _evaluate(options: argparse.Namespace, console: Console) -> None:
     results = drive_tracks(policy, options.tracks, options.simulator, console)
     console.print(results_table(results))
     write_results(options.json or options.model.parent / "evaluation.json", results)
+    return 0
+
+
+def _add_simulator(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--simulator", choices=list(ENVIRONMENTS), default="highway", help="what the car drives on")
 
 
 def _positive(text: str) -> int:

@@ -18,7 +18,7 @@ from sb3_sap.envs import score
 from sb3_sap.files import atomic_path
 
 #: The lane-keeping task on each simulator.
-ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0"}
+ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0", "torcs": "sap/TorcsLaneKeeping-v0"}
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ class ScriptedSimulator:
         self.track: Track = get_track("wheel-2")
         self.length = 100.0
         self.control_step = control_step
+        self.start = {"distance": 0.0, "track_pos": 0.0, "angle": 0.0}
         self.states = list(states)
         self.steered: list[float] = []
         self.closed = False
@@ -179,7 +180,7 @@ def test_actions_are_clipped_and_nan_refused() -> None:
     drive(env, action=-3.0)
     drive(env, action=0.25)
     assert env.simulator.steered == [1.0, -1.0, 0.25]  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match="action must be a steering in \\[-1, 1\\], got NaN"):
+    with pytest.raises(ValueError, match=r"action must be numbers in \[-1, 1\], got \[nan\]"):
         drive(env, action=math.nan)
 
 

@@ -1,4 +1,4 @@
-"""Environments. Importing this registers ``sap/LaneKeeping-v0``; simulators are imported when one is made."""
+"""Environments. Importing this registers them; simulators are imported when one is made."""
 
 from __future__ import annotations
 
@@ -37,9 +37,57 @@ def make_lane_keeping(
     return LaneKeepingEnv(simulator, laps=laps, random_start=random_start, render_mode=render_mode)
 
 
-make_lane_keeping.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make asks it for render modes
+def make_torcs_lane_keeping(
+    track: str | os.PathLike[str] = "wheel-2",
+    speed: float = 50.0,
+    control_step: float = 0.2,
+    car: str = "car1-trb1",
+    start: str = "training",
+    laps: int | None = 1,
+    random_start: bool = False,
+    render_mode: str | None = None,
+) -> LaneKeepingEnv:
+    """Make `LaneKeepingEnv` on TORCS: what ``gym.make("sap/TorcsLaneKeeping-v0", …)`` calls.
 
-register("sap/LaneKeeping-v0", "sb3_sap.envs:make_lane_keeping", max_episode_steps=MAX_EPISODE_STEPS)
+    :param track: name of a track that TORCS ships, or the path of a track file
+    :param speed: default speed, km/h
+    :param control_step: s between two actions, a multiple of 0.002
+    :param car: name of a car that TORCS ships
+    :param start: "training", 100 m before the line, or "race", the engine's own grid
+    :param laps: laps to drive, or None to drive on
+    :param random_start: start anywhere on the track
+    :param render_mode: None, "rgb_array" or "human"
+    """
+    from sb3_sap.envs.torcs.simulator import TorcsSimulator
+
+    simulator = TorcsSimulator(track, speed, control_step, car, start)
+    return LaneKeepingEnv(simulator, laps=laps, random_start=random_start, render_mode=render_mode)
+
+
+def make_torcs_driving(
+    track: str | os.PathLike[str] = "wheel-2",
+    control_step: float = 0.1,
+    car: str = "car1-trb1",
+    start: str = "training",
+    laps: int | None = 1,
+    random_start: bool = False,
+    render_mode: str | None = None,
+) -> LaneKeepingEnv:
+    """Make `DrivingEnv` on TORCS: what ``gym.make("sap/TorcsDriving-v0", …)`` calls. Parameters as above."""
+    from sb3_sap.envs.torcs.driving import DrivingEnv
+    from sb3_sap.envs.torcs.simulator import TorcsSimulator
+
+    simulator = TorcsSimulator(track, control_step=control_step, car=car, start=start)
+    return DrivingEnv(simulator, laps=laps, random_start=random_start, render_mode=render_mode)
+
+
+for _name, _maker in {
+    "sap/LaneKeeping-v0": make_lane_keeping,
+    "sap/TorcsLaneKeeping-v0": make_torcs_lane_keeping,
+    "sap/TorcsDriving-v0": make_torcs_driving,
+}.items():
+    _maker.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make asks it for render modes
+    register(_name, f"{__name__}:{_maker.__name__}", max_episode_steps=MAX_EPISODE_STEPS)
 
 __all__ = [
     "TRACKS",
@@ -52,5 +100,7 @@ __all__ = [
     "constraint_ce2",
     "get_track",
     "make_lane_keeping",
+    "make_torcs_driving",
+    "make_torcs_lane_keeping",
     "score",
 ]

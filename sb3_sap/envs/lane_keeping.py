@@ -166,6 +166,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
         self._limit = limit
         self._viewer: Any = None
+        self._on_road = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -179,6 +180,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
             start["angle"] = self.np_random.uniform(-RANDOM_ANGLE, RANDOM_ANGLE)
         start.update(_checked_start(options or {}, self.simulator.length))
         self._state = self.simulator.reset(**start)
+        self._on_road = True
         self._steering = 0.0
         self._progress = 0.0  # m
         self._steps = 0
@@ -189,11 +191,13 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Steer for one control step and return observation (5,), reward, terminated, truncated and ``info``."""
-        action = np.asarray(action, dtype=np.float64).reshape(self.action_space.shape)
-        if np.isnan(action).any():
-            raise ValueError(f"action must lie in [-1, 1], got {action}, which holds NaN.")
+        controls = np.asarray(action, dtype=np.float64).reshape(self.action_space.shape).tolist()
+        if any(map(math.isnan, controls)):
+            raise ValueError(f"action must be numbers in [-1, 1], got {controls}.")
+        if not self._on_road:
+            raise RuntimeError("step() was called before reset(): the car is not on the road yet.")
         before, dt = self._state, self.simulator.control_step
-        self._state = state = self._drive(np.clip(action, -1.0, 1.0))
+        self._state = state = self._drive([min(max(control, -1.0), 1.0) for control in controls])
         half = self.simulator.length / 2
         self._progress += (state.distance - before.distance + half) % (2 * half) - half  # across the start line too
         self._steps += 1
@@ -210,8 +214,8 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         earned = OFF_TRACK_REWARD if lost else self._reward(before, state)
         return self._observation(), earned, lost or stands, finished, info
 
-    def _drive(self, action: NDArray[np.float64]) -> CarState:
-        self._steering = float(action[0])
+    def _drive(self, action: list[float]) -> CarState:
+        self._steering = action[0]
         return self.simulator.step(self._steering)
 
     def _reward(self, before: CarState, state: CarState) -> float:

@@ -66,7 +66,9 @@ class Installation:
         """The file of a category of cars, which cars name."""
         path = self.root / DATA / "categories" / f"{name}.xml"
         if not path.is_file():
-            raise TorcsNotFoundError(f"TORCS under {self.root} lacks {path.name}, the car's category: {HOW_TO_INSTALL}.")
+            raise TorcsNotFoundError(
+                f"TORCS under {self.root} lacks {path.name}, the car's category: {HOW_TO_INSTALL}."
+            )
         return path
 
 
@@ -98,8 +100,8 @@ def check_installation(root: Path) -> Installation:
     for path, expected in CHECKSUMS.items():
         if hashlib.sha256((root / path).read_bytes()).hexdigest() != expected:
             raise TorcsNotFoundError(
-                f"{root / path} is not the one of Debian's torcs 1.3.7+dfsg-5+b2 for amd64, whose structures this package "
-                f"knows; another would crash the process: {HOW_TO_INSTALL}."
+                f"{root / path} is not that of Debian's torcs 1.3.7+dfsg-5+b2 for amd64, the version known here: another "
+                f"would crash; {HOW_TO_INSTALL}."
             )
     return Installation(root)
 

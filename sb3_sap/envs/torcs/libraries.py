@@ -51,7 +51,9 @@ class Private:
                 ctypes.CDLL(shutil.copy(root / path, folder), mode=os.RTLD_LOCAL | os.RTLD_LAZY)
                 for path in MODULES.values()
             )
-        self.init = _function(simu, "_Z7SimInitiP6tTrackff", None, ctypes.c_int, pointer, ctypes.c_float, ctypes.c_float)
+        self.init = _function(
+            simu, "_Z7SimInitiP6tTrackff", None, ctypes.c_int, pointer, ctypes.c_float, ctypes.c_float
+        )
         self.configure = _function(simu, "_Z9SimConfigP6CarEltP6RmInfo", None, pointer, pointer)
         self.update = _function(simu, "_Z9SimUpdateP9Situationdi", None, pointer, ctypes.c_double, ctypes.c_int)
         self.shutdown = _function(simu, "_Z11SimShutdownv", None)

@@ -1,7 +1,7 @@
 """Replaying what a robot logged inside the real race engine: the proof that this physics is TORCS' own, to the bit.
 
-The same start and the same controls must give the same positions at every row. The files and the sequence are described in
-``tests/data/torcs/README.md``.
+The same start and the same controls must give the same positions at every row. The files and the sequence are described
+in ``tests/data/torcs/README.md``.
 """
 
 from __future__ import annotations
@@ -166,5 +166,3 @@ def _table(path: Path) -> pd.DataFrame:
     if not np.isfinite(table[list(needed)].to_numpy(float)).all():
         raise ValueError(f"{path} holds values that are no numbers.")
     return table
-
-

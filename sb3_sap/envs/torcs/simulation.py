@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import tempfile
 from bisect import bisect_right
 from pathlib import Path
@@ -59,7 +60,7 @@ class Simulation:
 
     def __init__(
         self,
-        track: str | Path = "wheel-2",
+        track: str | os.PathLike[str] = "wheel-2",
         car: str = "car1-trb1",
         skill_level: int = 0,
         fuel_factor: float = 0.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -29,7 +30,7 @@ class TorcsSimulator:
 
     def __init__(
         self,
-        track: str | Path = "wheel-2",
+        track: str | os.PathLike[str] = "wheel-2",
         speed: float = 50.0,
         control_step: float = 0.2,
         car: str = "car1-trb1",
@@ -68,6 +69,14 @@ class TorcsSimulator:
             simulation.advance(ticks)
         return self._state()
 
+    def drive(self, steering: float, pedal: float) -> CarState:
+        """Drive one control step at no default speed: pedal from -1, full brake, to 1, full throttle."""
+        simulation, throttle = self.simulation, self._throttle
+        for ticks in self._periods:
+            simulation.control(steering, max(pedal, 0.0), max(-pedal, 0.0), gear=throttle.gear(simulation.engine_speed))
+            simulation.advance(ticks)
+        return self._state()
+
     def close(self) -> None:
         """Give TORCS' libraries back."""
         self.simulation.close()
@@ -75,13 +84,11 @@ class TorcsSimulator:
     def _state(self) -> CarState:
         simulation = self.simulation
         x, y, z = simulation.velocity
-        return CarState(
-            simulation.angle, simulation.track_pos, x * KMH, y * KMH, z * KMH, simulation.distance
-        )
+        return CarState(simulation.angle, simulation.track_pos, x * KMH, y * KMH, z * KMH, simulation.distance)
 
 
 def race_grid(path: Path, length: float) -> dict[str, float]:
-    """The first place of the race engine's grid: as the track's own "Starting Grid" says, else 100 m before the line."""
+    """The first place of the race engine's grid, as the track's own section says, else 100 m before the line."""
     root = ElementTree.fromstring(flatten(path))
     grid = root.find("section[@name='Starting Grid']")
     found = {} if grid is None else {item.get("name"): item.get("val", "") for item in grid}

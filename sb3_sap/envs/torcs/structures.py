@@ -1,7 +1,7 @@
 """Layout of the TORCS 1.3.7 structures that the physics reads and writes (amd64).
 
-Only the members that are used have names; the rest is padding. Sizes and offsets are those of the package's binaries, and
-the sizes are asserted when this is imported.
+Only the members that are used have names; the rest is padding. Sizes and offsets are those of the package's binaries,
+and the sizes are asserted when this is imported.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Holding the default speed (section 5.1): the throttle, the brake and the gears that the paper's agent does not control."""
+"""Holding the default speed (section 5.1): throttle, brake and gears, which the paper's agent does not control."""
 
 from __future__ import annotations
 
 from sb3_sap.envs.torcs.simulation import Simulation
 
 PERIOD_TICKS = 10
-"""Ticks between two decisions, 50 Hz; the gearbox cuts the throttle while it shifts, so the controls are written anew."""
+"""Ticks between two decisions, 50 Hz. Shifting cuts the throttle command, so the controls are written each time."""
 GAIN = 0.08
 """Throttle per km/h below the target."""
 INTEGRAL_GAIN = 0.02
@@ -51,9 +51,10 @@ class SpeedHolder:
         if rear_right + rear_left - front_right - front_left > SLIP:
             throttle /= 2
         brake = min(max(BRAKE_GAIN * (-lack - BRAKE_MARGIN), 0.0), 1.0)
-        return throttle, brake, self._shift(simulation.engine_speed)
+        return throttle, brake, self.gear(simulation.engine_speed)
 
-    def _shift(self, engine_speed: float) -> int:
+    def gear(self, engine_speed: float) -> int:
+        """The gear of the next period, shifted by the engine's speed [rad/s]."""
         self._since_shift += PERIOD
         if self._since_shift >= SHIFT_TIME:
             step = (engine_speed > SHIFT_UP and self._gear < 6) - (engine_speed < SHIFT_DOWN and self._gear > 1)

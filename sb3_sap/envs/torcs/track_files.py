@@ -1,8 +1,8 @@
 """Making TORCS' track files safe to read for its own parser.
 
-They claim UTF-8 but hold Latin-1 bytes and pull in other files as external entities. Under a Python that is linked to the
-system's expat, that parser refuses the objects' file and the track library then crashes. So it is handed a clean copy:
-ASCII, the surfaces inlined, the objects, which the physics does not need, left out.
+They claim UTF-8 but hold Latin-1 bytes and pull in other files as external entities. Under a Python that is linked to
+the system's expat, that parser refuses the objects' file and the track library then crashes. So it is handed a clean
+copy: ASCII, the surfaces inlined, the objects, which the physics does not need, left out.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from sb3_sap.envs.tracks import read_track_xml
 
 ENTITY = re.compile(r'<!ENTITY\s+([\w.-]+)\s+SYSTEM\s+"([^"]*)"\s*>')
 PROLOG = re.compile(r"<\?xml.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*(\[.*?\]\s*)?>", re.DOTALL)
+OTHER_ENTITY = re.compile(r"&(?!amp;|lt;|gt;|quot;|apos;|#)[\w.-]+;")
 KEPT_ENTITY = "default-surfaces"
 
 
@@ -31,22 +32,14 @@ def flatten(path: Path) -> bytes:
             raise ValueError(f"{path} needs {inlined}, the road surfaces, which is missing: install TORCS' data again.")
         replacement = PROLOG.sub("", _read(inlined)) if name == KEPT_ENTITY else ""
         text = text.replace(f"&{name};", replacement)
+    text = OTHER_ENTITY.sub("", PROLOG.sub("", text))
     try:
-        root = ElementTree.fromstring(PROLOG.sub("", text).strip())
+        root = ElementTree.fromstring(text.strip())
     except ElementTree.ParseError as error:
         raise ValueError(f"{path} is not a readable TORCS track file: {error}.") from error
-    _check_surfaces(root, path)
-    return ElementTree.tostring(root, encoding="us-ascii", xml_declaration=True)
+    document: bytes = ElementTree.tostring(root, encoding="us-ascii", xml_declaration=True)
+    return document
 
 
 def _read(path: Path) -> str:
     return path.read_bytes().decode("latin-1")
-
-
-def _check_surfaces(root: ElementTree.Element, path: Path) -> None:
-    """Every surface that the road names must be defined: the library dereferences what it does not find."""
-    defined = {section.get("name") for section in root.findall("section[@name='Surfaces']/section")}
-    for element in root.find("section[@name='Main Track']").iter("attstr"):  # type: ignore[union-attr]
-        name = element.get("name", "")
-        if name.endswith("surface") and element.get("val") not in defined:
-            raise ValueError(f"{path}: {name} is {element.get('val')!r}, a surface that the file does not define.")

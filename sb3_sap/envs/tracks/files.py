@@ -14,8 +14,11 @@ from sb3_sap.envs.tracks.geometry import Segment, Track
 COLUMNS = ("type", "length_m", "radius_m", "end_radius_m", "turn_deg", "steps")
 """The table's columns. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the others."""
 
-UNITS = {"m": 1.0, "km": 1000.0, "cm": 0.01, "deg": math.pi / 180, "rad": 1.0}
+UNITS = {"m": 1.0, "km": 1000.0, "cm": 0.01, "mm": 0.001, "ft": 0.304801, "deg": math.pi / 180, "rad": 1.0}
 """Units of length and angle in track files, in m and rad."""
+
+SEGMENT_LISTS = ("Track Segments", "segments")
+"""What newer and older files call the list of segments."""
 
 
 def parse_table(lines: Iterable[str], name: str) -> Track:
@@ -72,7 +75,8 @@ def read_track_xml(path: str | Path) -> Track:
     except ElementTree.ParseError as error:
         raise ValueError(f"{path} is not a readable TORCS track file: {error}.") from error
     main = root.find("section[@name='Main Track']")
-    sections = root.findall("section[@name='Main Track']/section[@name='Track Segments']/section")
+    lists = [] if main is None else [main.find(f"section[@name='{name}']") for name in SEGMENT_LISTS]
+    sections = [section for found in lists if found is not None for section in found.findall("section")]
     if main is None or not sections:
         raise ValueError(f"{path} has no section 'Main Track' with 'Track Segments': not a TORCS track file.")
     step_length = _attribute(main, "profil steps length", path)

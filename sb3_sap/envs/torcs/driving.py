@@ -1,0 +1,112 @@
+"""``sap/TorcsDriving-v0``: steering and pedal at racing speed, several dimensions, which the paper leaves open."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_sap.envs.lane_keeping import OBSERVATION_LIMIT, OBSERVATION_SCALE, CarState, LaneKeepingEnv
+from sb3_sap.envs.torcs.simulator import TorcsSimulator
+
+LOOK_AHEAD = (5.0, 10.0, 20.0, 35.0, 55.0, 80.0, 110.0, 150.0)
+"""m ahead of the car at which the road's curvature is observed."""
+CURVATURE_SCALE = 0.02
+"""1/m that one unit of the observation is, a curve of 50 m radius."""
+CURVATURE_LIMIT = 5.0
+"""Largest magnitude of an observed curvature, in those units."""
+MAX_ACCELERATION = 20.0
+"""m/s². More than the tyres can give in any direction (about 1.5 g): what it cannot do cannot be done."""
+EDGE_TIME = 1.0
+"""s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
+KMH = 3.6
+HALF_WIDTH = slice(5 + len(LOOK_AHEAD), 6 + len(LOOK_AHEAD))
+"""Where the observation holds half the road's width …"""
+WIDTH_SCALE = 10.0
+"""… in units of 10 m."""
+
+
+def lateral_velocity(obs: NDArray[Any]) -> NDArray[Any]:
+    """Speed across the road, m/s, positive to the left; (n,) of (n, obs_dim)."""
+    angle, speed_x, speed_y = obs[:, 0], obs[:, 2] * OBSERVATION_SCALE[2] / KMH, obs[:, 3] * OBSERVATION_SCALE[3] / KMH
+    return speed_y * np.cos(angle) - speed_x * np.sin(angle)  # type: ignore[no-any-return]
+
+
+def ap_function(obs: NDArray[Any], actions: NDArray[Any], next_obs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Two mistakes that no fast lap contains; each is judged where the step began and confirmed by what it led to.
+
+    1. *Running wide*: at its lateral speed the car reaches the edge within a second, and the step made that
+       lateral speed larger. Leaving the road ends the episode, so the speed must be taken back, and the later
+       the more it costs.
+    2. *Too fast for what lies ahead*: even tyres better than the car's could not brake from here to a speed that holds
+       the road at some point ahead, and the step made the car faster still.
+
+    Both are sound only as far as their constants are: `MAX_ACCELERATION` lies above what the tyres give, so the second
+    forbids nothing possible; the first may in principle forbid a short cut along the edge.
+
+    :param obs: (n, 14) as the environment returns them
+    :param actions: (n, 2)
+    :param next_obs: (n, 14)
+    :return: (n,) True where permissible
+    """
+    del actions
+    outward = lateral_velocity(next_obs) * np.sign(next_obs[:, 1])
+    room = (1 - np.abs(next_obs[:, 1])) * next_obs[:, HALF_WIDTH][:, 0] * WIDTH_SCALE  # m to the edge
+    faster_outward = outward > lateral_velocity(obs) * np.sign(next_obs[:, 1])
+    runs_wide = (outward > 0) & (room < outward * EDGE_TIME) & faster_outward
+    return ~(runs_wide | (too_fast(obs) & (next_obs[:, 2] > obs[:, 2])))  # type: ignore[no-any-return]
+
+
+def too_fast(obs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where no braking could make the car slow enough for the road ahead; (n,) of (n, obs_dim)."""
+    curvature = np.abs(obs[:, 5 : 5 + len(LOOK_AHEAD)]) * CURVATURE_SCALE  # (n, points), 1/m
+    speed_squared = (obs[:, 2:3] * OBSERVATION_SCALE[2] / KMH) ** 2
+    holds = MAX_ACCELERATION / np.maximum(curvature, 1e-6)  # v² at which the tyres still hold the curve
+    can_brake = 2 * MAX_ACCELERATION * np.array(LOOK_AHEAD)  # v² that braking takes off on the way there
+    return (speed_squared > holds + can_brake).any(axis=1)  # type: ignore[no-any-return]
+
+
+class DrivingEnv(LaneKeepingEnv):
+    """Drive as fast as the road allows (TORCS alone).
+
+    Observation, (14,): the five of lane keeping; the road's curvature at `LOOK_AHEAD` metres, in units of
+    `CURVATURE_SCALE`, positive to the left; half the road's width in units of `WIDTH_SCALE` m. Action, (2,): steering,
+    positive to the left; pedal, from -1 (full brake) to 1 (full throttle); the gears are automatic. Reward: metres of
+    progress along the centre line. Episodes end as in lane keeping.
+    """
+
+    simulator: TorcsSimulator
+
+    def __init__(self, simulator: TorcsSimulator, **kwargs: Any):
+        super().__init__(simulator, **kwargs)
+        own = np.full(len(LOOK_AHEAD) + 1, CURVATURE_LIMIT)
+        self._limit = np.concatenate([OBSERVATION_LIMIT / OBSERVATION_SCALE, own]).astype(np.float32)
+        # Racing speeds go beyond those of lane keeping.
+        self._limit[2] = 400.0 / OBSERVATION_SCALE[2]
+        self.observation_space = gym.spaces.Box(-self._limit, self._limit, dtype=np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+    def _drive(self, action: list[float]) -> CarState:
+        self._steering = action[0]
+        self._last_observation = self._observation()
+        return self.simulator.drive(*action)
+
+    def _reward(self, before: CarState, state: CarState) -> float:
+        half = self.simulator.length / 2
+        return (state.distance - before.distance + half) % (2 * half) - half
+
+    def _permissible(self, before: CarState, state: CarState) -> bool:
+        obs, next_obs = self._last_observation[None], self._observation()[None]
+        return bool(ap_function(obs, np.zeros((1, 2)), next_obs)[0])
+
+    def _observation(self) -> NDArray[np.float32]:
+        track, state = self.simulator.track, self._state
+        ahead = [
+            track.pieces[track.piece_at((state.distance + metres) % track.length)].curvature / CURVATURE_SCALE
+            for metres in LOOK_AHEAD
+        ]
+        half_width = track.width / 2 / WIDTH_SCALE
+        raw = np.concatenate([np.array(state[:5]) / OBSERVATION_SCALE, ahead, [half_width]])
+        return np.clip(raw.astype(np.float32), -self._limit, self._limit)

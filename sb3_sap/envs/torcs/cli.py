@@ -47,11 +47,11 @@ def _install(options: argparse.Namespace, console: Console) -> int:
 
 
 def _check(options: argparse.Namespace, console: Console) -> int:
-    from sb3_sap.envs.torcs.installation import find_installation
+    from sb3_sap.envs.torcs.installation import VERSION, find_installation
     from sb3_sap.envs.torcs.simulator import TorcsSimulator
 
     found = find_installation()
-    console.print(f"TORCS 1.3.7+dfsg-5+b2 in {found.root}")
+    console.print(f"TORCS {VERSION} in {found.root}")
     console.print(f"{len(found.tracks())} tracks: {', '.join(found.tracks())}")
     simulator = TorcsSimulator("wheel-2")
     state = simulator.reset(**simulator.start)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import subprocess
@@ -10,26 +9,15 @@ import tempfile
 from pathlib import Path
 
 from sb3_sap.envs.torcs.installation import (
-    CHECKSUMS,
-    DATA,
-    LIBRARIES,
+    VERSION,
     Installation,
     TorcsNotFoundError,
     check_installation,
+    checksums,
+    digest,
 )
 
 PACKAGES = ("torcs", "torcs-data", "libplib1")
-KEPT = (
-    (LIBRARIES / "torcs/lib", "*.so"),
-    (LIBRARIES / "torcs/modules/simu", "*.so"),
-    (LIBRARIES / "torcs/modules/track", "*.so"),
-    (LIBRARIES, "libplib*.so*"),
-    (DATA / "tracks", "*/*/*.xml"),
-    (DATA / "data/tracks", "*.xml"),
-    (DATA / "cars", "*/*.xml"),
-    (DATA / "categories", "*.xml"),
-)
-"""(folder, pattern) of what is kept: about 7 MB of 550."""
 
 
 def install(root: Path) -> Installation:
@@ -49,12 +37,8 @@ def install(root: Path) -> Installation:
             _run(["dpkg-deb", "-x", str(package), str(unpacked)], work, "download it again")
             package.unlink()
         kept = work / "kept"
-        for place, pattern in KEPT:
-            for path in (unpacked / place).glob(pattern):
-                target = kept / path.relative_to(unpacked)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(path, target)
-        _verify(kept)
+        for path, expected in checksums().items():
+            _keep(unpacked / path, kept / path, expected)
         old = work / "old"
         if root.exists():
             os.replace(root, old)
@@ -62,15 +46,14 @@ def install(root: Path) -> Installation:
     return check_installation(root)
 
 
-def _verify(kept: Path) -> None:
-    for path, expected in CHECKSUMS.items():
-        if not (kept / path).is_file():
-            raise TorcsNotFoundError(f"The packages hold no {path}: only Debian's torcs for amd64 is known.")
-        if hashlib.sha256((kept / path).read_bytes()).hexdigest() != expected:
-            raise TorcsNotFoundError(
-                f"The packages' {path.name} is not that of Debian's torcs 1.3.7+dfsg-5+b2, the version that is known: "
-                "another would crash the process. Nothing was installed."
-            )
+def _keep(source: Path, target: Path, expected: str) -> None:
+    if not source.is_file() or digest(source) != expected:
+        raise TorcsNotFoundError(
+            f"The packages' {source.name} is not that of Debian's torcs {VERSION} for amd64, the only version that is "
+            "known: nothing was installed."
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy2(source, target)
 
 
 def _run(command: list[str], folder: Path, remedy: str) -> None:

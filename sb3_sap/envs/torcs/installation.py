@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 import platform
 import sys
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from pathlib import Path
 
 LIBRARIES = Path("usr/lib/x86_64-linux-gnu")
@@ -21,11 +24,8 @@ SHARED = (
 )
 """In the order in which they must be loaded."""
 HOW_TO_INSTALL = "run `sb3-sap torcs install`, or `apt-get install torcs` on Debian, or set TORCS_ROOT to where it is"
-CHECKSUMS = {
-    MODULES["simu"]: "2b9ee883a6e28dd640e474b8ca36e8a7a6746fe47d61832c4a76a76e900c6f36",
-    MODULES["track"]: "71f856b0015b8243dc7e3cf2201ca55025b6b2b34521850d9109172440246e11",
-}
-"""SHA-256 of the binaries whose structure layout is known: Debian's torcs 1.3.7+dfsg-5+b2, amd64."""
+VERSION = "1.3.7+dfsg-5+b2"
+"""Debian's torcs for amd64, whose structures are known; ``checksums.txt`` has the SHA-256 of each file that is used."""
 
 
 class TorcsNotFoundError(RuntimeError):
@@ -36,6 +36,18 @@ def user_root() -> Path:
     """Where ``sb3-sap torcs install`` puts TORCS."""
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
     return Path(data) / "sb3_sap" / "torcs"
+
+
+@cache
+def checksums() -> dict[Path, str]:
+    """SHA-256 of every file of TORCS that is used, by its path below the root."""
+    lines = resources.files(__package__).joinpath("checksums.txt").read_text(encoding="ascii").splitlines()
+    return {Path(path): digest for digest, path in map(str.split, lines)}
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -71,6 +83,10 @@ class Installation:
             )
         return path
 
+    def is_original(self, path: Path) -> bool:
+        """Whether a file is, to the byte, one that TORCS ships."""
+        return path.is_relative_to(self.root) and digest(path) == checksums().get(path.relative_to(self.root))
+
 
 def find_installation() -> Installation:
     """The TORCS of ``TORCS_ROOT`` if it is set, else of the user's data folder, else of the system.
@@ -91,17 +107,15 @@ def find_installation() -> Installation:
 
 
 def check_installation(root: Path) -> Installation:
-    """Checks that everything is there and that the physics is the binary whose layout is known."""
-    import hashlib
-
+    """Checks that everything is there and that the libraries are those whose structures are known."""
     for path in (*SHARED, *MODULES.values(), DATA / "tracks", DATA / "cars", DATA / "categories"):
         if not (root / path).exists():
             raise TorcsNotFoundError(f"TORCS under {root} is not whole, {path} is missing: {HOW_TO_INSTALL}.")
-    for path, expected in CHECKSUMS.items():
-        if hashlib.sha256((root / path).read_bytes()).hexdigest() != expected:
+    for path in (*SHARED, *MODULES.values()):
+        if digest(root / path) != checksums()[path]:
             raise TorcsNotFoundError(
-                f"{root / path} is not that of Debian's torcs 1.3.7+dfsg-5+b2 for amd64, the version known here: another "
-                f"would crash; {HOW_TO_INSTALL}."
+                f"{root / path} is not that of Debian's torcs {VERSION} for amd64, the only one that is known and "
+                f"cannot crash Python: {HOW_TO_INSTALL}."
             )
     return Installation(root)
 

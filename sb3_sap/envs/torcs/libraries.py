@@ -31,7 +31,6 @@ class Shared:
         string, pointer = ctypes.c_char_p, ctypes.c_void_p
         self.read_parameters = _function(tgf, "_Z14GfParmReadFilePKci", pointer, string, ctypes.c_int)
         self.merge = _function(tgf, "_Z18GfParmMergeHandlesPvS_i", pointer, pointer, pointer, ctypes.c_int)
-        self.get_string = _function(tgf, "_Z12GfParmGetStrPvPKcS1_S1_", string, pointer, string, string, string)
         self.to_global = _function(
             tools, "_Z19RtTrackLocal2GlobalP10tTrkLocPosPfS1_i", None, _Position, _Float, _Float, ctypes.c_int
         )

@@ -6,12 +6,14 @@ import ctypes
 import math
 import os
 import tempfile
+import xml.etree.ElementTree as ElementTree
 from bisect import bisect_right
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_sap.envs.torcs.installation import Installation, find_installation
 from sb3_sap.envs.torcs.libraries import MERGE_ALL, READ_STANDARD, pool
+from sb3_sap.envs.torcs.probe import survives
 from sb3_sap.envs.torcs.structures import (
     PLACED,
     RUNNING,
@@ -33,6 +35,10 @@ SETTLE_TICKS = 500
 MAX_DAMAGE = 10_000
 SKILL_LEVELS = range(4)
 """0 rookie to 3 pro; the level changes the grip of the tyres."""
+
+
+TRIAL_PLACES, TRIAL_TICKS = 40, 100
+"""Where, and how long, files that TORCS does not ship are tried out."""
 
 
 class Segment(NamedTuple):
@@ -66,6 +72,7 @@ class Simulation:
         fuel_factor: float = 0.0,
         damage_factor: float = 0.0,
         installation: Installation | None = None,
+        _trial: bool = False,
     ):
         installation = installation or find_installation()
         if skill_level not in SKILL_LEVELS:
@@ -74,11 +81,21 @@ class Simulation:
         self.track_path = path if path.suffix == ".xml" and path.is_file() else installation.track(str(track))
         track_file = flatten(self.track_path)
         car_file = installation.car(car)
+        category_file = installation.category(car_category(car_file))
+        unknown = [f for f in (self.track_path, car_file, category_file) if not installation.is_original(f)]
+        if unknown and not _trial:
+            options = track, car, skill_level, fuel_factor, damage_factor, installation
+            fate = survives(lambda: Simulation(*options, _trial=True).drive_everywhere())
+            if fate is not None:
+                raise ValueError(
+                    f"TORCS' own code {fate} with {' and '.join(map(str, unknown))}, which it does not ship: compare it "
+                    "with a file that it does."
+                )
         self._factors = float(fuel_factor), float(damage_factor)
         self._skill_level = skill_level
         self._pool = pool(installation)
         self._shared = self._pool.shared
-        self._car_handle = self._read_car(car_file, installation)
+        self._car_handle = self._read_car(car_file, category_file)
         self._library: Any = self._pool.acquire()
         self._running = False
         with tempfile.NamedTemporaryFile(suffix=".xml") as file:
@@ -92,13 +109,13 @@ class Simulation:
         self._starts = [segment.from_start for segment in self.segments]
         self._make_structures()
 
-    def _read_car(self, car_file: Path, installation: Installation) -> Any:
-        handle = self._shared.read_parameters(str(car_file).encode(), READ_STANDARD)
-        if not handle:
-            raise ValueError(f"{car_file} is not a readable TORCS car file: install TORCS' data again.")
-        category = self._shared.get_string(handle, b"Car", b"category", b"").decode()
-        category_handle = self._shared.read_parameters(str(installation.category(category)).encode(), READ_STANDARD)
-        return self._shared.merge(category_handle, handle, MERGE_ALL)
+    def _read_car(self, car_file: Path, category_file: Path) -> Any:
+        handles = [
+            self._shared.read_parameters(str(file).encode(), READ_STANDARD) for file in (category_file, car_file)
+        ]
+        if not all(handles):
+            raise ValueError(f"TORCS cannot read {car_file} with {category_file}: install TORCS' data again.")
+        return self._shared.merge(*handles, MERGE_ALL)
 
     def _read_segments(self) -> list[Segment]:
         segments = []
@@ -136,6 +153,8 @@ class Simulation:
         :param height: m above the road from which it is dropped
         """
         self._check_open()
+        if not all(map(math.isfinite, (distance, track_pos, angle, height))):
+            raise ValueError(f"A car can only be placed at finite numbers, got {(distance, track_pos, angle, height)}.")
         segment = self.segments[max(bisect_right(self._starts, distance % self.length) - 1, 0)]
         to_start = distance % self.length - segment.from_start
         if self._running:
@@ -170,6 +189,13 @@ class Simulation:
         :param clutch: 0 to 1
         :param gear: -1 (reverse) to the highest
         """
+        if not (
+            -1 <= steer <= 1 and 0 <= accelerator <= 1 and 0 <= brake <= 1 and 0 <= clutch <= 1 and -1 <= gear <= 6
+        ):
+            raise ValueError(
+                "Controls must lie in -1..1 (steer), 0..1 (accelerator, brake, clutch) and -1..6 (gear), got "
+                f"{steer}, {accelerator}, {brake}, {clutch}, {gear}."
+            )
         car = self.car
         car.steer, car.accelerator, car.brake, car.clutch, car.gear_command = steer, accelerator, brake, clutch, gear
 
@@ -238,7 +264,17 @@ class Simulation:
 
     @property
     def _segment(self) -> Segment:
+        if not self._running:
+            raise RuntimeError("The car stands on no road yet, or the simulation is closed: call `place` first.")
         return self._segment_at[self._position.segment]
+
+    def drive_everywhere(self) -> None:
+        """Places the car at many places and drives a little, to see whether TORCS survives it."""
+        for i in range(TRIAL_PLACES):
+            self.place(i / TRIAL_PLACES * self.length)
+            for steer in (1.0, -1.0):
+                self.control(steer, 1.0)
+                self.advance(TRIAL_TICKS)
 
     def close(self) -> None:
         """Gives the libraries back; the simulation can no longer be used."""
@@ -254,3 +290,15 @@ class Simulation:
     def _check_open(self) -> None:
         if self._library is None:
             raise RuntimeError("The simulation is closed: make a new one.")
+
+
+def car_category(path: Path) -> str:
+    """The category that a car's file names."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path} is not a readable TORCS car file ({error}): install TORCS' data again.") from error
+    found = root.find("section[@name='Car']/attstr[@name='category']")
+    if found is None:
+        raise ValueError(f"{path} names no category in its section 'Car': install TORCS' data again.")
+    return found.get("val", "")

@@ -1,0 +1,42 @@
+"""Trying out, in a process of its own, files that TORCS does not ship.
+
+TORCS' parsers and physics follow what a file says without looking: a missing section or an odd number can crash them or
+never let them return. What Debian ships is known to work; anything else is first driven in a child process.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import warnings
+from collections.abc import Callable
+
+TIME_LIMIT = 10
+"""s after which a trial is given up."""
+
+
+def survives(trial: Callable[[], object]) -> str | None:
+    """Runs a trial in a forked child and says how it died, or None if it lived; exceptions are no death."""
+    with warnings.catch_warnings():
+        # Newer Pythons warn of forking beside threads; this child calls C code alone and leaves at once.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        _run(trial)
+    _, status = os.waitpid(child, 0)
+    if not os.WIFSIGNALED(status):
+        return None
+    number = os.WTERMSIG(status)
+    return "does not return" if number == signal.SIGALRM else f"crashes ({signal.Signals(number).name})"
+
+
+def _run(trial: Callable[[], object]) -> None:
+    try:
+        silence = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silence, 1)
+        os.dup2(silence, 2)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(TIME_LIMIT)
+        trial()
+    finally:
+        os._exit(0)

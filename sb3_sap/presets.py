@@ -31,14 +31,14 @@ def load_config(algo: str) -> dict[str, dict[str, Any]]:
 
 
 def preset_names(algo: str = "ddpg_ap") -> list[str]:
-    """The presets of an algorithm: the entries that are neither environments nor the default."""
-    return [name for name in load_config(algo) if "/" not in name and name != "default" and not name.endswith("-3k")]
+    """The presets of an algorithm: the entries that are no environments, the constructor's own settings among them."""
+    return [name for name in load_config(algo) if "/" not in name and not name.endswith("-3k")]
 
 
 def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[str, Any]:
     """Constructor arguments: ``DDPGAP("MlpPolicy", env, **preset("paper"))``.
 
-    :param name: such as ``"paper"``, the values of section 5.1
+    :param name: ``"paper"``, the values of section 5.1, or ``"default"``, the constructor's own
     :param algo: the algorithm, by its RL Zoo name
     :param steps: planned length of the training; None: the preset's own
     """

@@ -78,7 +78,7 @@ def test_every_config_is_installed_and_has_an_algorithm():
     [
         (("papper",), "did you mean 'paper'"),
         (("paper", "ddpg_pa"), "did you mean 'ddpg_ap'"),
-        (("x",), "one of 'paper'"),
+        (("x",), "one of 'paper', 'default'"),
     ],
 )
 def test_unknown_names(arguments, message):

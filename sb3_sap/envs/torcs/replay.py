@@ -157,7 +157,7 @@ def _conditions(path: Path, name: str) -> dict[str, Any]:
 def _table(path: Path) -> pd.DataFrame:
     needed = ("t_s", *CONTROLS, *STATES)
     try:
-        table = pd.read_csv(path, float_precision="round_trip")
+        table = pd.read_csv(path)
     except (OSError, EOFError, ValueError) as error:
         raise ValueError(f"{path} is not a readable trace: {error}.") from error
     missing = [column for column in needed if column not in table]

@@ -88,8 +88,8 @@ class Simulation:
             fate = survives(lambda: Simulation(*options, _trial=True).drive_everywhere())
             if fate is not None:
                 raise ValueError(
-                    f"TORCS' own code {fate} with {' and '.join(map(str, unknown))}, which it does not ship: compare it "
-                    "with a file that it does."
+                    f"TORCS' own code {fate} with {' and '.join(map(str, unknown))}, which it does not ship: compare "
+                    "it with a file that it does."
                 )
         self._factors = float(fuel_factor), float(damage_factor)
         self._skill_level = skill_level

@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Networks this small train no faster on two threads; two processes side by side do.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-all lint coverage clean
+.PHONY: demo test test-all torcs lint coverage clean
 
 demo: .venv/.installed
 	$(BIN)/sb3-sap demo
@@ -14,6 +14,10 @@ test: .venv/.installed
 
 test-all: test
 	$(BIN)/pytest -q -n 2 -m slow
+
+# The reference simulator, from Debian's packages, without root.
+torcs: .venv/.installed
+	$(BIN)/sb3-sap torcs check 2>/dev/null || $(BIN)/sb3-sap torcs install
 
 lint: .venv/.installed
 	$(BIN)/ruff check .

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from tables import markdown
 
 from sb3_sap import DDPGAP
 from sb3_sap.files import atomic_path
@@ -75,7 +76,10 @@ def main(seeds: int, out: Path) -> None:
             with atomic_path(out) as temporary:
                 pd.DataFrame(rows).round(4).to_csv(temporary, index=False)
             print(rows[-1], flush=True)
-    print(pd.DataFrame(rows).groupby("setting", sort=False).mean().drop(columns="seed").round(3).to_string())
+    means = pd.DataFrame(rows).groupby("setting", sort=False).mean().drop(columns="seed").round(3)
+    with atomic_path(out.with_suffix(".md")) as temporary:
+        temporary.write_text(markdown(means.reset_index()), encoding="utf-8")
+    print(means)
 
 
 if __name__ == "__main__":

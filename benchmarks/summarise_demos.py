@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from tables import markdown
 
 from sb3_sap.files import atomic_path
 from sb3_sap.statistics import bootstrap_interval, interquartile_mean
@@ -41,6 +42,8 @@ def summarise(laps: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for algo in ORDER:
         of_algo = laps[laps["algo"] == algo]
+        if of_algo.empty:
+            continue
         # (seeds, tracks)
         scores = of_algo.pivot(index="seed", columns="track", values="score").to_numpy()
         low, high = bootstrap_interval(scores)
@@ -73,9 +76,7 @@ if __name__ == "__main__":
     laps = collect(options.folder)
     with atomic_path(options.out.with_suffix(".csv")) as temporary:
         laps.to_csv(temporary, index=False)
-    lines = summarise(laps).astype(str).agg(" | ".join, axis=1)
-    header = list(summarise(laps).columns)
-    text = "\n".join([" | ".join(header), " | ".join("---" for _ in header), *lines]) + "\n"
+    text = markdown(summarise(laps))
     with atomic_path(options.out.with_suffix(".md")) as temporary:
         temporary.write_text(text, encoding="utf-8")
     print(text)

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+import torch as th
 from rich.console import Console
 
 from sb3_sap import __version__
@@ -16,6 +17,8 @@ from sb3_sap.evaluation import ENVIRONMENTS
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code; what the user got wrong is told in one sentence."""
     options = parser().parse_args(arguments)
+    # Networks this small run no faster on two threads, and one thread always adds in the same order.
+    th.set_num_threads(1)
     try:
         code: int = options.run(options, Console())
     except KeyboardInterrupt:

@@ -31,7 +31,7 @@ def install(root: Path) -> Installation:
     root.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=root.parent, prefix=".torcs-") as folder:
         work = Path(folder)
-        _run(["apt-get", "download", *PACKAGES], work, "run `apt-get update` first, as root, or check the network")
+        _download(work)
         unpacked = work / "unpacked"
         for package in work.glob("*.deb"):
             _run(["dpkg-deb", "-x", str(package), str(unpacked)], work, "download it again")
@@ -46,6 +46,16 @@ def install(root: Path) -> Installation:
     return check_installation(root)
 
 
+def _download(folder: Path) -> None:
+    command = ["apt-get", "download", *PACKAGES]
+    if os.geteuid() == 0:
+        if subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0:
+            return
+        # A new machine has no package lists yet.
+        _run(["apt-get", "update"], folder, "check the network")
+    _run(command, folder, "run `apt-get update` first, as root, or check the network")
+
+
 def _keep(source: Path, target: Path, expected: str) -> None:
     if not source.is_file() or digest(source) != expected:
         raise TorcsNotFoundError(
@@ -57,7 +67,6 @@ def _keep(source: Path, target: Path, expected: str) -> None:
 
 
 def _run(command: list[str], folder: Path, remedy: str) -> None:
-    # apt drops its rights for downloads, and the folder belongs to whoever runs this.
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
         lines = (done.stderr or done.stdout).strip().splitlines() or ["no message"]

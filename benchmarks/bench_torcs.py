@@ -1,0 +1,42 @@
+"""Control steps per second of sap/TorcsLaneKeeping-v0 through the whole Gymnasium stack, and what bounds them.
+
+Processor time of one core.
+
+python benchmarks/bench_torcs.py [TRACK]
+"""
+
+import sys
+import time
+
+import gymnasium as gym
+import numpy as np
+
+import sb3_sap  # noqa: F401  # registers the environment
+from sb3_sap.envs.torcs.simulation import TICK
+
+STEPS = {0.2: 4_000, 0.02: 40_000}
+TICKS = 100_000
+
+
+def main(track: str = "wheel-2") -> None:
+    """Drive with linear feedback, which stays on the road, and print the rates; then the physics alone."""
+    gains = np.array([2.5 / 0.366519, -1.6, 0.0, 1.0, 0.0], dtype=np.float32)
+    for control_step, steps in STEPS.items():
+        env = gym.make("sap/TorcsLaneKeeping-v0", track=track, control_step=control_step, laps=None)
+        obs, _ = env.reset(seed=0)
+        begin = time.process_time()
+        for _ in range(steps):
+            obs, _, terminated, truncated, _ = env.step(np.clip(gains @ obs, -1, 1).reshape(1))
+            if terminated or truncated:
+                obs, _ = env.reset()
+        rate = steps / (time.process_time() - begin)
+        print(f"control step {control_step} s: {rate:,.0f} steps/s, {rate * control_step:,.0f}× real time")
+    simulation = env.unwrapped.simulator.simulation
+    begin = time.process_time()
+    simulation.advance(TICKS)
+    seconds = time.process_time() - begin
+    print(f"the physics alone: {1e6 * seconds / TICKS:.2f} µs per tick, {TICKS * TICK / seconds:,.0f}× real time")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2])

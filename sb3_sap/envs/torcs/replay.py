@@ -121,7 +121,7 @@ def to_json(comparison: Comparison) -> str:
 
 def _drive(simulation: Simulation, table: pd.DataFrame, grid: dict[str, Any]) -> np.ndarray[Any, Any]:
     """The simulated states, (rows, columns) float32."""
-    width = simulation.segments[-1].width
+    width = simulation.road.segments[-1].width
     to_middle = grid["to_right_m"] - width / 2
     simulation.place(grid["start_pos_m"], 2 * to_middle / width, height=grid["initial_height_m"])
     simulation.advance(PRESTART_TICKS, PRESTART)

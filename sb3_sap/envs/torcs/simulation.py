@@ -5,24 +5,20 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-import tempfile
 import xml.etree.ElementTree as ElementTree
-from bisect import bisect_right
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sb3_sap.envs.torcs.installation import Installation, find_installation
 from sb3_sap.envs.torcs.libraries import MERGE_ALL, READ_STANDARD, pool
 from sb3_sap.envs.torcs.probe import survives
+from sb3_sap.envs.torcs.road import Road, Segment
 from sb3_sap.envs.torcs.structures import (
     PLACED,
     RUNNING,
-    STRAIGHT,
     CarStructure,
     RaceStructure,
     SituationStructure,
-    TrackSegment,
-    TrackStructure,
 )
 from sb3_sap.envs.torcs.track_files import flatten
 
@@ -35,20 +31,8 @@ SETTLE_TICKS = 500
 MAX_DAMAGE = 10_000
 SKILL_LEVELS = range(4)
 """0 rookie to 3 pro; the level changes the grip of the tyres."""
-
-
 TRIAL_PLACES, TRIAL_TICKS = 40, 100
 """Where, and how long, files that TORCS does not ship are tried out."""
-
-
-class Segment(NamedTuple):
-    """A segment of the road, as TORCS built it."""
-
-    address: int
-    type: int
-    from_start: float  # m
-    radius: float  # m, 0 on straights
-    width: float  # m
 
 
 class Simulation:
@@ -98,15 +82,8 @@ class Simulation:
         self._car_handle = self._read_car(car_file, category_file)
         self._library: Any = self._pool.acquire()
         self._running = False
-        with tempfile.NamedTemporaryFile(suffix=".xml") as file:
-            file.write(track_file)
-            file.flush()
-            address = self._library.build_track(file.name.encode())
-        self._track = TrackStructure.from_address(address)
-        self.length: float = self._track.length
-        self.segments = self._read_segments()
-        self._segment_at = {segment.address: segment for segment in self.segments}
-        self._starts = [segment.from_start for segment in self.segments]
+        self.road = Road(self._library, track_file)
+        self.length = self.road.length
         self._make_structures()
 
     def _read_car(self, car_file: Path, category_file: Path) -> Any:
@@ -116,16 +93,6 @@ class Simulation:
         if not all(handles):
             raise ValueError(f"TORCS cannot read {car_file} with {category_file}: install TORCS' data again.")
         return self._shared.merge(*handles, MERGE_ALL)
-
-    def _read_segments(self) -> list[Segment]:
-        segments = []
-        address = TrackSegment.from_address(self._track.last_segment).next
-        for _ in range(self._track.n_segments):
-            found = TrackSegment.from_address(address)
-            radius = 0.0 if found.type == STRAIGHT else found.radius
-            segments.append(Segment(address, found.type, found.from_start, radius, found.width))
-            address = found.next
-        return segments
 
     def _make_structures(self) -> None:
         self.car: Any = CarStructure()
@@ -139,7 +106,7 @@ class Simulation:
         self._situation.cars = ctypes.addressof(self._cars)
         self._race.car_list = ctypes.addressof(self.car)
         self._race.situation = ctypes.addressof(self._situation)
-        self._race.track = ctypes.addressof(self._track)
+        self._race.track = ctypes.addressof(self.road.structure)
         self._pose, self._velocity = self.car.pose, self.car.velocity
         self._wheels = list(self.car.wheels)
         self._at = ctypes.byref(self._position)
@@ -155,15 +122,15 @@ class Simulation:
         self._check_open()
         if not all(map(math.isfinite, (distance, track_pos, angle, height))):
             raise ValueError(f"A car can only be placed at finite numbers, got {(distance, track_pos, angle, height)}.")
-        segment = self.segments[max(bisect_right(self._starts, distance % self.length) - 1, 0)]
-        to_start = distance % self.length - segment.from_start
+        distance %= self.length
+        segment = self.road.segment(distance)
         if self._running:
             self._library.shutdown()
         ctypes.memset(ctypes.addressof(self.car), 0, ctypes.sizeof(self.car))
         self.car.skill_level, self.car.car_handle = self._skill_level, self._car_handle
         position = self._position
         position.segment = segment.address
-        position.to_start = to_start if segment.type == STRAIGHT else to_start / segment.radius
+        position.to_start = segment.to_start(distance - segment.from_start)
         position.to_middle = track_pos * segment.width / 2
         position.to_right = segment.width / 2 + position.to_middle
         position.to_left = segment.width - position.to_right
@@ -173,7 +140,7 @@ class Simulation:
         self._pose[2] = self._shared.height(self._at) + height
         self._pose[5] = (self.heading - angle) % (2 * math.pi)
         self._situation.race_state, self._situation.current_time = PLACED, 0.0
-        self._library.init(1, ctypes.addressof(self._track), *self._factors)
+        self._library.init(1, ctypes.addressof(self.road.structure), *self._factors)
         self._running = True
         self._library.configure(ctypes.addressof(self.car), ctypes.addressof(self._race))
         self.advance(1, PLACED)
@@ -237,9 +204,8 @@ class Simulation:
     @property
     def distance(self) -> float:
         """m along the centre line from the start line, in [0, length)."""
-        segment, to_start = self._segment, self._position.to_start
-        along = segment.from_start + (to_start if segment.type == STRAIGHT else to_start * segment.radius)
-        return along % self.length  # type: ignore[no-any-return]
+        segment = self._segment
+        return (segment.from_start + segment.along(self._position.to_start)) % self.length
 
     @property
     def wheel_spins(self) -> tuple[float, float, float, float]:
@@ -266,7 +232,7 @@ class Simulation:
     def _segment(self) -> Segment:
         if not self._running:
             raise RuntimeError("The car stands on no road yet, or the simulation is closed: call `place` first.")
-        return self._segment_at[self._position.segment]
+        return self.road.at_address[self._position.segment]
 
     def drive_everywhere(self) -> None:
         """Places the car at many places and drives a little, to see whether TORCS survives it."""
@@ -284,8 +250,14 @@ class Simulation:
         if self._running:
             library.shutdown()
             self._running = False
-        library.close_track()
+        if hasattr(self, "road"):  # else the track was never built
+            library.close_track()
         self._pool.release(library)
+
+    def __del__(self) -> None:
+        # Environments are often dropped without being closed; the libraries go back all the same.
+        if getattr(self, "_library", None) is not None:
+            self.close()
 
     def _check_open(self) -> None:
         if self._library is None:

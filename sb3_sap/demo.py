@@ -42,7 +42,7 @@ class Run:
     """What to train, where, and where to leave the results."""
 
     algo: str = "ddpg_ap"
-    preset: str = "paper"
+    preset: str = "default"
     steps: int = 3_000
     seed: int = 0
     track: str = "wheel-2"
@@ -80,7 +80,7 @@ def demo(run: Run, console: Console) -> list[LapResult]:
     env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
     settings = preset(run.preset, run.algo, run.steps)
     model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
-    console.print(f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} ({run.preset} preset)")
+    console.print(f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {run.preset!r})")
     log = TrainingLog()
     try:
         model.learn(run.steps, callback=log, progress_bar=console.is_terminal)

@@ -33,7 +33,7 @@ def test_demo_leaves_what_it_promises(demo):
     for name in pictures:
         with Image.open(demo / name) as image:
             assert image.getextrema() is not None
-    assert DDPGAP.load(demo / "model.zip").t_k == 150
+    assert DDPGAP.load(demo / "model.zip").noise_steps == 100
 
 
 def test_evaluate_repeats_the_demos_laps(demo, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from typing import Any, cast
 
@@ -92,14 +93,13 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         # A network of our own must not shift the global generator, or runs would no longer compare to the base's.
         with th.random.fork_rng(devices=[]):
             th.default_generator.manual_seed(int(make_rng(self.seed, "predictor").integers(2**31)))
-            self.predictor = PermissibilityPredictor(
-                self.observation_space, self.action_space, **self._predictor_arguments()
-            ).to(self.device)
+            self.predictor = self._make_predictor().to(self.device)
 
     def _check_settings(self) -> None:
         for name in ("alpha", "alpha_low"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"`{name}` is a probability from 0 to 1, but is {getattr(self, name)}.")
+            probability = getattr(self, name)
+            if not (isinstance(probability, (int, float)) and 0 <= probability <= 1):
+                raise ValueError(f"`{name}` is a probability from 0 to 1, but is {probability!r}.")
         if self.t_k is not None and self.t_k < 0:
             raise ValueError(f"`t_k` is a number of steps, 0 or more, but is {self.t_k}.")
         least = {"n_candidates": 1, "min_per_class": 1, "dataset_size": 2, "validation_size": 2}
@@ -148,11 +148,16 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     def _resolved_ap_function(self) -> APFunction | None:
         return None if self.ap_function is None else resolve(self.ap_function, "ap_function")
 
-    def _predictor_arguments(self) -> dict[str, Any]:
-        """What E shares with the policy unless told otherwise: how observations become features."""
+    def _make_predictor(self) -> PermissibilityPredictor:
+        # Unless told otherwise E turns observations into features as the policy does.
         shared = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
-        defaults = {name: getattr(self.policy, name) for name in shared}
-        return {**defaults, **(self.predictor_kwargs or {})}
+        arguments = {name: getattr(self.policy, name) for name in shared} | dict(self.predictor_kwargs or {})
+        known = inspect.signature(PermissibilityPredictor).parameters
+        for name in arguments.keys() - known.keys():
+            raise TypeError(
+                f"`predictor_kwargs` holds {name!r}, but PermissibilityPredictor takes {', '.join(list(known)[2:])}."
+            )
+        return PermissibilityPredictor(self.observation_space, self.action_space, **arguments)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)

@@ -99,6 +99,7 @@ def test_a_wrapper_that_labels_with_numbers():
         ({"alpha": -0.1}, "^`alpha` is a probability from 0 to 1, but is -0.1"),
         ({"alpha": float("nan")}, "^`alpha` is a probability from 0 to 1, but is nan"),
         ({"alpha_low": 2}, "^`alpha_low` is a probability from 0 to 1, but is 2"),
+        ({"alpha": "much"}, "^`alpha` is a probability from 0 to 1, but is 'much'"),
         ({"t_k": -1}, "^`t_k` is a number of steps, 0 or more, but is -1"),
         ({"n_candidates": 0}, "^`n_candidates` must be at least 1, but is 0"),
         ({"min_per_class": 0}, "^`min_per_class` must be at least 1, but is 0"),
@@ -125,6 +126,13 @@ def test_a_wrapper_that_labels_with_numbers():
 def test_settings_that_cannot_work_fail_in_the_constructor(algorithm, settings, message):
     with pytest.raises(ValueError, match=message):
         build(algorithm, **settings)
+
+
+def test_unknown_arguments_of_the_predictor_are_named():
+    with pytest.raises(
+        TypeError, match="^`predictor_kwargs` holds 'layers', but PermissibilityPredictor takes net_arch, "
+    ):
+        build(DDPGAP, predictor_kwargs={"layers": [64]})
 
 
 def test_the_smallest_settings_that_can_work():

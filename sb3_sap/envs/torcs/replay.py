@@ -48,7 +48,7 @@ STATES: dict[str, Callable[[Simulation], Any]] = {
     "engine_rad_s": lambda simulation: simulation.engine_speed,
     "gear_1": lambda simulation: simulation.gear,
 }
-"""What is compared, by column of a trace."""
+"""What is compared, by column of a trace; x and y must be there."""
 POSITION = ("x_m", "y_m")
 PRESTART_TICKS = 509
 """Ticks between settling and the first row, with the brake on."""
@@ -97,9 +97,10 @@ def replay(trace: Path, start_conditions: Path) -> Comparison:
     finally:
         simulation.close()
     # Traces hold 32-bit floats; comparing as such compares bits, but for the sign of a zero.
-    expected = table[list(STATES)].to_numpy(np.float32)
+    columns = [column for column in STATES if column in table]
+    expected = table[columns].to_numpy(np.float32)
+    simulated = simulated[:, [list(STATES).index(column) for column in columns]]
     same = expected == simulated
-    columns = list(STATES)
     same_position = same[:, [columns.index(column) for column in POSITION]].all(axis=1)
     different = np.flatnonzero(~same_position)
     deviation = np.abs(expected.astype(float) - simulated.astype(float)).max(axis=0)
@@ -121,7 +122,7 @@ def to_json(comparison: Comparison) -> str:
 
 def _drive(simulation: Simulation, table: pd.DataFrame, grid: dict[str, Any]) -> np.ndarray[Any, Any]:
     """The simulated states, (rows, columns) float32."""
-    width = simulation.road.segments[-1].width
+    width = simulation.road.segment(grid["start_pos_m"]).width
     to_middle = grid["to_right_m"] - width / 2
     simulation.place(grid["start_pos_m"], 2 * to_middle / width, height=grid["initial_height_m"])
     simulation.advance(PRESTART_TICKS, PRESTART)
@@ -155,7 +156,7 @@ def _conditions(path: Path, name: str) -> dict[str, Any]:
 
 
 def _table(path: Path) -> pd.DataFrame:
-    needed = ("t_s", *CONTROLS, *STATES)
+    needed = ("t_s", *CONTROLS, *POSITION)
     try:
         table = pd.read_csv(path)
     except (OSError, EOFError, ValueError) as error:

@@ -1,7 +1,7 @@
 """A Stable-Baselines3 extension that learns which actions are permissible while it learns to act."""
 
 from sb3_sap import envs
-from sb3_sap.algorithms import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2
+from sb3_sap.algorithms import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2, SACAP, TD3AP, TQCAP, CrossQAP
 from sb3_sap.buffers import (
     KnowledgeMixin,
     PermissibilityDictReplayBuffer,
@@ -23,9 +23,13 @@ __all__ = [
     "DDPGAPCE2",
     "DDPGCE1",
     "DDPGCE2",
+    "SACAP",
+    "TD3AP",
+    "TQCAP",
     "ActionPermissibility",
     "ActionPermissibilityMixin",
     "ConstrainedExplorationMixin",
+    "CrossQAP",
     "KnowledgeBuffer",
     "KnowledgeMixin",
     "PermissibilityCallback",

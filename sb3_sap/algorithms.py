@@ -1,10 +1,12 @@
-"""The algorithms a user names: the paper's DDPG-AP and its baselines (section 5.1)."""
+"""The algorithms a user names: the paper's DDPG-AP and its baselines (section 5.1), and every other off-policy base."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG as PlainDDPG
+from stable_baselines3 import SAC, TD3
 
 from sb3_sap.constraints import ActionConstraint, ConstrainedExplorationMixin
 from sb3_sap.exploration import ActionPermissibilityMixin
@@ -49,3 +51,25 @@ class DDPGAPCE2(ActionPermissibilityMixin, PlainDDPG):
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
         super().__init__(*args, constraint=constraint, **kwargs)
+
+
+class TD3AP(ActionPermissibilityMixin, TD3):
+    """TD3 guided by action permissibility."""
+
+
+class SACAP(ActionPermissibilityMixin, SAC):
+    """SAC guided by action permissibility. Its policy explores by itself, before t_k and after."""
+
+    stochastic_policy: ClassVar[bool] = True
+
+
+class TQCAP(ActionPermissibilityMixin, TQC):
+    """TQC guided by action permissibility."""
+
+    stochastic_policy: ClassVar[bool] = True
+
+
+class CrossQAP(ActionPermissibilityMixin, CrossQ):
+    """CrossQ guided by action permissibility."""
+
+    stochastic_policy: ClassVar[bool] = True

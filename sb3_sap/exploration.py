@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch as th
@@ -12,9 +12,11 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_sap.actor_loss import permissible_actor_step
 from sb3_sap.buffers import KnowledgeMixin, guided_buffer_class
 from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.constraints import ConstrainedExplorationMixin
@@ -45,8 +47,13 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
     :param min_per_class: examples of each class that K must hold before E is fitted
+    :param actor_permissibility_coef: β of the permissible actor loss, a number or an SB3 schedule; 0 is the paper's
+        method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for ``alpha``
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
     """
+
+    #: Whether the policy explores by itself, so that the steps before t_k need no action noise.
+    stochastic_policy: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -61,6 +68,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         dataset_size: int = 512,
         validation_size: int = 200,
         min_per_class: int = 20,
+        actor_permissibility_coef: float | Schedule = 0.0,
         predictor_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -74,6 +82,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         self.dataset_size = dataset_size
         self.validation_size = validation_size
         self.min_per_class = min_per_class
+        self.actor_permissibility_coef = actor_permissibility_coef
         self.predictor_kwargs = predictor_kwargs
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
@@ -106,7 +115,7 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
         for name, minimum in least.items():
             if getattr(self, name) < minimum:
                 raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(self, name)}.")
-        if self.noise_steps > self.learning_starts and self.action_noise is None and not self.use_sde:
+        if self.noise_steps > self.learning_starts and self.action_noise is None and not self.stochastic_policy:
             warnings.warn(
                 f"`t_k` = {self.t_k} is beyond `learning_starts` = {self.learning_starts}, but there is no "
                 "`action_noise`: between the two a deterministic policy does not explore.",
@@ -194,8 +203,28 @@ class ActionPermissibilityMixin(ConstrainedExplorationMixin):
     @property
     def current_alpha(self) -> float:
         """α as E's validation accuracy allows it (section 4.3)."""
-        sufficient = self.validation_accuracy >= SUFFICIENT_ACCURACY
-        return self.alpha if sufficient else min(self.alpha_low, self.alpha)
+        return self.alpha if self.predictor_suffices else min(self.alpha_low, self.alpha)
+
+    @property
+    def predictor_suffices(self) -> bool:
+        """Whether E was right often enough on its last validation sample."""
+        return self.validation_accuracy >= SUFFICIENT_ACCURACY
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        super().train(gradient_steps, batch_size)
+        coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
+        if coef == 0 or not self.predictor_suffices:
+            return
+        for _ in range(gradient_steps):
+            loss = permissible_actor_step(
+                self.actor,
+                self.predictor,
+                cast(KnowledgeMixin, self.replay_buffer),
+                coef,
+                batch_size,
+                self._vec_normalize_env,
+            )
+            self.logger.record_mean("sap/actor_loss", loss)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

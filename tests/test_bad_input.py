@@ -6,7 +6,7 @@ import pytest
 from gymnasium import spaces
 from toy import ALGORITHMS, CONSTRAINED, GUIDED, Line, build
 
-from sb3_sap import DDPG, DDPGAP, ActionPermissibility
+from sb3_sap import DDPG, DDPGAP, SACAP, ActionPermissibility
 from sb3_sap.settings import make_action_noise
 
 
@@ -141,7 +141,7 @@ def test_the_smallest_settings_that_can_work():
     build(DDPGAP, knowledge_buffer_size=16, min_per_class=7).learn(60)
 
 
-@pytest.mark.parametrize("algorithm", GUIDED)
+@pytest.mark.parametrize("algorithm", [algorithm for algorithm in GUIDED if not algorithm.stochastic_policy])
 def test_t_k_beyond_the_warm_up_without_noise_warns(algorithm):
     with pytest.warns(
         UserWarning, match="^`t_k` = 11 is beyond `learning_starts` = 10, but there is no `action_noise`"
@@ -153,6 +153,7 @@ def test_t_k_beyond_the_warm_up_without_noise_warns(algorithm):
 @pytest.mark.parametrize("settings", [{}, {"t_k": 10}, {"t_k": 11, "action_noise": {"type": "normal", "sigma": 0.1}}])
 def test_no_warning_where_the_policy_explores(settings):
     build(DDPGAP, **settings)
+    build(SACAP, t_k=11)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import sb3_contrib
 import stable_baselines3
 import torch as th
 from gymnasium import spaces
@@ -15,7 +16,7 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import GUIDED, Line, build, nearby
 
-from sb3_sap import DDPG, DDPGAP, DDPGAPCE2
+from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, SACAP, TD3AP, TQCAP, CrossQAP
 from sb3_sap.exploration import stratified_candidates
 
 
@@ -372,6 +373,22 @@ def test_unguided_it_equals_ddpg_to_the_bit(algorithm, make_env):
     assert th.equal(*torch_states)
     if algorithm is DDPGAP:
         assert runs[1].predictor.fitted
+
+
+BASES = {
+    TD3AP: stable_baselines3.TD3,
+    SACAP: stable_baselines3.SAC,
+    TQCAP: sb3_contrib.TQC,
+    CrossQAP: sb3_contrib.CrossQ,
+}
+
+
+@pytest.mark.parametrize(("algorithm", "base"), BASES.items(), ids=[algorithm.__name__ for algorithm in BASES])
+def test_unguided_every_algorithm_equals_its_base_to_the_bit(algorithm, base):
+    plain = build(base).learn(150)
+    unguided = build(algorithm, alpha=0.0, t_k=10).learn(150)
+    assert_same_to_the_bit(plain, unguided)
+    assert unguided.predictor.fitted
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)

@@ -17,7 +17,7 @@ FLOORS = (
     {"zoo", "benchmark", "evaluation", "plots", "presets", "statistics"},
     {"algorithms"},
     {"exploration"},
-    {"constraints", "callbacks", "buffers", "knowledge", "predictor", "settings"},
+    {"constraints", "callbacks", "buffers", "knowledge", "predictor", "settings", "actor_loss"},
     {"permissibility", "generators", "files"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}

@@ -101,7 +101,8 @@ def test_a_loaded_model_predicts_the_same_without_an_environment(algorithm, tmp_
     model = build(algorithm).learn(30)
     model.save(tmp_path / "model")
     obs = np.random.default_rng(0).normal(size=(20, 2)).astype(np.float32)
-    np.testing.assert_array_equal(algorithm.load(tmp_path / "model").predict(obs)[0], model.predict(obs)[0])
+    loaded, own = (m.predict(obs, deterministic=True)[0] for m in (algorithm.load(tmp_path / "model"), model))
+    np.testing.assert_array_equal(loaded, own)
 
 
 def test_load_can_change_settings(tmp_path):
@@ -130,7 +131,7 @@ def test_an_n_step_model_stays_one(tmp_path):
 def test_parameters_contain_the_predictor_and_can_be_set(algorithm):
     trained, fresh = build(algorithm).learn(80), build(algorithm, seed=2)
     parameters = trained.get_parameters()
-    assert set(parameters) == {"policy", "actor.optimizer", "critic.optimizer", "predictor", "predictor.optimizer"}
+    assert set(parameters) >= {"policy", "actor.optimizer", "critic.optimizer", "predictor", "predictor.optimizer"}
     assert not fresh.predictor.fitted
     fresh.set_parameters(parameters)
     for name, value in flat(fresh.get_parameters()).items():

@@ -1,0 +1,103 @@
+"""The permissible actor loss: what it moves, what it leaves alone, and that it teaches the actor."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.utils import set_random_seed
+from torch.nn import functional as F
+from toy import GUIDED, build
+
+from sb3_sap import DDPGAP, SACAP, CrossQAP
+from sb3_sap.actor_loss import permissible_actor_step
+
+
+def mean_action(model, observations):
+    return model.predict(observations, deterministic=True)[0]
+
+
+def weights(module):
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def same(one, other):
+    return all(th.equal(value, other[name]) for name, value in one.items())
+
+
+def test_one_step_is_the_gradient_of_the_cross_entropy():
+    model = build(DDPGAP).learn(40)
+    model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=0.5)
+    before = weights(model.actor)
+    set_random_seed(0)
+    observations = model.replay_buffer.sample(8).observations
+    labels = th.ones(8)
+    expected = 2.0 * F.binary_cross_entropy_with_logits(
+        model.predictor(observations, model.actor(observations)), labels
+    )
+    gradients = th.autograd.grad(expected, list(model.actor.parameters()))
+    set_random_seed(0)
+    loss = permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=2.0, batch_size=8)
+    assert loss == pytest.approx(expected.item())
+    for (name, parameter), gradient in zip(model.actor.named_parameters(), gradients, strict=True):
+        th.testing.assert_close(parameter, before[name] - 0.5 * gradient)
+
+
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_it_moves_the_actor_alone(algorithm):
+    model = build(algorithm).learn(60)
+    predictor, critic, actor = weights(model.predictor), weights(model.critic), weights(model.actor)
+    gradients = {name: parameter.grad.clone() for name, parameter in model.predictor.named_parameters()}
+    model.policy.set_training_mode(True)
+    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    assert same(weights(model.predictor), predictor)
+    assert same(gradients, {name: parameter.grad for name, parameter in model.predictor.named_parameters()})
+    assert same(weights(model.critic), critic)
+    assert not same(weights(model.actor), actor)
+
+
+def test_running_statistics_stand_still():
+    model = build(CrossQAP).learn(60)
+    before = {name: value.clone() for name, value in model.actor.named_buffers()}
+    assert before
+    model.policy.set_training_mode(True)
+    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    assert same(dict(model.actor.named_buffers()), before)
+
+
+def test_the_spread_of_a_stochastic_policy_is_left_alone():
+    model = build(SACAP).learn(60)
+    before = weights(model.actor.log_std)
+    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    assert same(weights(model.actor.log_std), before)
+
+
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_it_teaches_the_actor_what_e_knows(algorithm):
+    """E learns from 400 random steps; right of the centre only going left is permissible."""
+    wide = {"predictor_kwargs": {"net_arch": [32]}, "dataset_size": 64, "policy_kwargs": {"net_arch": [32]}}
+    model = build(algorithm, learning_starts=400, learning_rate=0.01, **wide).learn(400)
+    assert model.validation_accuracy > 0.7
+    for _ in range(200):
+        permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=32)
+    rows = np.array([[-0.8, 0.5], [-0.4, 0.5], [0.4, 0.5], [0.8, 0.5]], dtype=np.float32)
+    assert np.array_equal(np.sign(mean_action(model, rows)[:, 0]), [1, 1, -1, -1])
+
+
+def test_zero_is_the_papers_method_to_the_bit_and_a_schedule_works():
+    plain, zero = build(DDPGAP).learn(80), build(DDPGAP, actor_permissibility_coef=lambda _: 0.0).learn(80)
+    assert same(weights(plain.policy), weights(zero.policy))
+    some = build(DDPGAP, actor_permissibility_coef=lambda remaining: remaining).learn(80)
+    assert not same(weights(plain.policy), weights(some.policy))
+
+
+def test_it_waits_until_e_is_good_enough(monkeypatch):
+    calls = []
+    monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
+    model = build(DDPGAP, actor_permissibility_coef=1.0)
+    model.learn(60)
+    calls.clear()
+    model.validation_accuracy = 0.69
+    model.train(1, 8)
+    assert not calls
+    model.validation_accuracy = 0.7
+    model.train(3, 8)
+    assert len(calls) == 3

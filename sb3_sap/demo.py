@@ -110,13 +110,15 @@ def drive_tracks(policy: Any, tracks: list[str], simulator: str, console: Consol
 def results_table(results: list[LapResult], algo: str | None = None, steps: int = 3_000) -> Table:
     """The results as the paper's Table 2 shows them, beside its own row of the same algorithm where there is one."""
     paper = TABLE_2.get(steps, TABLE_2[3_000]).get(algo or "", {})
-    paper_steps = f"{steps if steps in TABLE_2 else 3_000:,}"
-    table = Table(title="One lap of each track, the actor alone")
-    for name in ("track", "lap done", "covered", "total reward", "score S"):
-        table.add_column(name, justify="left" if name == "track" else "right")
+    title = "One lap of each track, the actor alone"
     if paper:
-        table.add_column(f"paper, {paper_steps} steps: covered", justify="right", style="dim")
-        table.add_column("score S", justify="right", style="dim")
+        title += f"; the paper's, after {steps if steps in TABLE_2 else 3_000:,} steps, beside it"
+    table = Table(title=title)
+    for name in ("track", "lap done", "covered", "total reward", "score S"):
+        table.add_column(name, justify="left" if name == "track" else "right", no_wrap=name == "track")
+    if paper:
+        table.add_column("paper: covered", justify="right", style="dim")
+        table.add_column("S", justify="right", style="dim")
     for result in results:
         row = [
             TRACKS.get(result.track, result.track),

@@ -67,11 +67,17 @@ def predictor_beliefs(model: Any, speed: float) -> Figure:
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     steering = np.linspace(-1, 1, RESOLUTION)
-    sweeps = ((1, 1.0, "trackPos (+1 left edge), car aligned with the road"), (0, 0.5, "angle [rad], car on the axis"))
-    for axis, (variable, limit, label) in zip(axes, sweeps, strict=True):
+    # On the axis itself Eq. (6) forbids almost everything, so the angle is swept beside it.
+    beside = 0.3
+    sweeps = (
+        (1, 1.0, 0.0, "trackPos (+1 left edge), car aligned with the road"),
+        (0, 0.5, beside, f"angle [rad] (+ points right), car at trackPos {beside}"),
+    )
+    for axis, (variable, limit, track_pos, label) in zip(axes, sweeps, strict=True):
         values = np.linspace(-limit, limit, RESOLUTION)
         raw = np.zeros((RESOLUTION, 5))
-        raw[:, variable], raw[:, 2] = values, speed
+        raw[:, 1], raw[:, 2] = track_pos, speed
+        raw[:, variable] = values
         obs = (raw / OBSERVATION_SCALE).astype(np.float32)
         image = axis.pcolormesh(
             values, steering, permissible_probability(model, obs, steering).T, cmap="RdYlGn", vmin=0, vmax=1

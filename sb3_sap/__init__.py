@@ -13,6 +13,7 @@ from sb3_sap.callbacks import PermissibilityCallback
 from sb3_sap.constraints import ConstrainedExplorationMixin
 from sb3_sap.exploration import ActionPermissibilityMixin
 from sb3_sap.knowledge import KnowledgeBuffer
+from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import ActionPermissibility
 from sb3_sap.predictor import PermissibilityPredictor
 
@@ -32,6 +33,7 @@ __all__ = [
     "CrossQAP",
     "KnowledgeBuffer",
     "KnowledgeMixin",
+    "LearnedPermissibilityMixin",
     "PermissibilityCallback",
     "PermissibilityDictReplayBuffer",
     "PermissibilityHerReplayBuffer",

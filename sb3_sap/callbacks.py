@@ -1,4 +1,4 @@
-"""Trains and validates the AP predictor beside the agent (section 4.2) and sets α (section 4.3)."""
+"""Trains and validates the AP predictor beside the agent (section 4.2)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sb3_sap.buffers import KnowledgeMixin
 from sb3_sap.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
 
 if TYPE_CHECKING:
-    from sb3_sap.exploration import ActionPermissibilityMixin
+    from sb3_sap.learning import LearnedPermissibilityMixin
 
 #: Labels of one class alone, after which the user is told that the AP function separates nothing.
 CONSTANT_LABELS_WARNING = 1_000
@@ -25,7 +25,7 @@ class PermissibilityCallback(BaseCallback):
     pass an instance to ``learn(callback=...)``: it takes the place of the default.
     """
 
-    model: ActionPermissibilityMixin
+    model: LearnedPermissibilityMixin
 
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
@@ -73,7 +73,6 @@ class PermissibilityCallback(BaseCallback):
         self.logger.record("sap/validation_accuracy", model.validation_accuracy)
         self.logger.record("sap/validation_accuracy_permissible", permissible)
         self.logger.record("sap/validation_accuracy_non_permissible", non_permissible)
-        self.logger.record("sap/alpha", model.current_alpha)
 
     def _warn_of_constant_labels(self, seen: list[int]) -> None:
         self._warned = True

@@ -17,6 +17,7 @@ FLOORS = (
     {"zoo", "benchmark", "evaluation", "plots", "presets", "statistics"},
     {"algorithms"},
     {"exploration"},
+    {"learning"},
     {"constraints", "callbacks", "buffers", "knowledge", "predictor", "settings", "actor_loss"},
     {"permissibility", "generators", "files"},
 )

@@ -456,6 +456,27 @@ def test_damaged_surfaces(copy_of_torcs):
         Simulation("g-track-3", installation=copy_of_torcs)
 
 
+def test_a_track_without_a_road_leaves_no_trace(torcs, tmp_path):
+    """TORCS builds this one without a segment; the copy of the library that did so must not be used again."""
+    path = tmp_path / "empty.xml"
+    path.write_bytes(flatten(torcs.track("eroad")).replace(b'name="Header"', b'name="a/b"'))
+    code = (
+        "from sb3_sap.envs.torcs.simulation import Simulation\n"
+        f"try: Simulation({str(path)!r})\n"
+        "except ValueError as error: print(error)\n"
+        "Simulation('eroad').place(0.0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "empty.xml" in done.stdout
+
+
+def test_a_trial_that_ends_early_fails():
+    assert survives(lambda: None) is None
+    assert survives(lambda: 1 / 0) == "gives up"
+    assert survives(lambda: os._exit(0)) == "gives up"
+
+
 def test_a_track_of_ones_own(torcs, tmp_path):
     own = tmp_path / "own.xml"
     own.write_bytes(flatten(torcs.track("g-track-3")))

@@ -41,9 +41,9 @@ class Road:
             file.flush()
             with reading():
                 address = library.build_track(file.name.encode())
-        if not address:
-            raise ValueError("TORCS cannot build the track: its file lacks what TORCS looks for.")
-        self.structure: Any = TrackStructure.from_address(address)
+        self.structure: Any = TrackStructure.from_address(address) if address else None
+        if self.structure is None or not self.structure.last_segment:
+            raise ValueError("TORCS builds no road from the track file: compare it with one that TORCS ships.")
         self.length: float = self.structure.length
         self.segments = self._read_segments()
         self.at_address = {segment.address: segment for segment in self.segments}

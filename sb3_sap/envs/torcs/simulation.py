@@ -290,11 +290,11 @@ class Simulation:
         if self._running:
             library.shutdown()
             self._running = False
-        if hasattr(self, "road"):  # else the track was never built
-            library.close_track()
         with reading():
             self._shared.release_parameters(self._car_handle)
-        self._pool.release(library)
+        if hasattr(self, "road"):  # else the track is half built, and the next one in this copy would crash
+            library.close_track()
+            self._pool.release(library)
 
     def __del__(self) -> None:
         # Environments are often dropped without being closed; the libraries go back all the same.

@@ -180,6 +180,11 @@ def test_torcs_xml_is_read(tmp_path: Path) -> None:
         (XML.replace('name="lg"', 'name="length"'), "segment '1': a segment of type str needs positive values"),
         (XML.replace('val="20"', 'val="wide"'), "section '2': radius must be a number, got 'wide'"),
         (XML.replace('unit="deg"', 'unit="grad"'), "arc is given in 'grad'; expected one of m, km"),
+        (
+            XML.replace('steps" val="3"', 'steps" val="1e30"'),
+            r"segment '2': it is cut into 1e\+30 steps; expected 1 to",
+        ),
+        (XML.replace('unit="m" val="4.0"', 'unit="m" val="1e-320"'), "segment '1': it is cut into 10001 steps"),
         (XML.replace('name="width"', 'name="wide"'), "width of track 'course' must be a positive number"),
     ],
 )

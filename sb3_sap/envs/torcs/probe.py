@@ -18,14 +18,14 @@ SURVIVED = 42
 """Exit status of a trial that came to its end; TORCS ends a process with 0 or 1."""
 
 
-def survives(trial: Callable[[], object]) -> str | None:
+def survives(trial: Callable[[], object], limit: int = TIME_LIMIT) -> str | None:
     """Runs a trial in a forked child and says how it failed, or None if it came to its end."""
     with warnings.catch_warnings():
         # Newer Pythons warn of forking beside threads; this child calls C code alone and leaves at once.
         warnings.simplefilter("ignore", DeprecationWarning)
         child = os.fork()
     if child == 0:
-        _run(trial)
+        _run(trial, limit)
     _, status = os.waitpid(child, 0)
     if not os.WIFSIGNALED(status):
         # Not its end either: an exception, or TORCS ending the process. It would happen here again.
@@ -34,7 +34,7 @@ def survives(trial: Callable[[], object]) -> str | None:
     return "does not return" if number == signal.SIGALRM else f"crashes ({signal.Signals(number).name})"
 
 
-def _run(trial: Callable[[], object]) -> None:
+def _run(trial: Callable[[], object], limit: int) -> None:
     status = 1
     try:
         faulthandler.disable()  # a crash is expected, and told by the parent
@@ -42,7 +42,7 @@ def _run(trial: Callable[[], object]) -> None:
         os.dup2(silence, 1)
         os.dup2(silence, 2)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(TIME_LIMIT)
+        signal.alarm(limit)
         trial()
         status = SURVIVED
     finally:

@@ -14,6 +14,9 @@ from sb3_sap.envs.tracks.geometry import Segment, Track
 COLUMNS = ("type", "length_m", "radius_m", "end_radius_m", "turn_deg", "steps")
 """The table's columns. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the others."""
 
+MAX_STEPS = 10_000
+"""Steps that a segment may be cut into. TORCS' own tracks have at most a few hundred; each takes memory and time."""
+
 UNITS = {"m": 1.0, "km": 1000.0, "cm": 0.01, "mm": 0.001, "ft": 0.304801, "deg": math.pi / 180, "rad": 1.0}
 """Units of length and angle in track files, in m and rad."""
 
@@ -96,7 +99,9 @@ def _xml_segment(section: ElementTree.Element, step_length: float | None, path: 
     steps = found.get("profil steps", 1)
     step_length = found.get("profil steps length", step_length)
     if steps == 1 and step_length:
-        steps = int(segment.length / step_length) + 1
+        steps = int(min(segment.length / step_length, MAX_STEPS)) + 1
+    if not 1 <= steps <= MAX_STEPS:
+        raise ValueError(f"{place}: it is cut into {steps:g} steps; expected 1 to {MAX_STEPS}.")
     return segment._replace(steps=int(steps))
 
 

@@ -288,6 +288,19 @@ def test_libraries_are_used_again(torcs):
     assert copies() == before > 0
 
 
+def test_closing_gives_everything_back(torcs):
+    def make_and_close(times):
+        for _ in range(times):
+            simulation = Simulation("g-track-3")
+            simulation.place(0.0)
+            simulation.close()
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4  # KiB
+
+    before = make_and_close(20)
+    assert make_and_close(60) - before < 1_000  # each car's parameters are 0.1 MB
+
+
 # ---------------------------------------------------------------- what users do wrong
 
 
@@ -297,6 +310,7 @@ def test_wrong_names_and_values(torcs):
         "did you mean 'car1-trb3' or 'car1-trb1'": {"car": "car1-trb"},
         "start must be one of 'training', 'race'": {"start": "grid"},
         "multiple of 0.002 s, got 0.001": {"control_step": 0.001},
+        "multiple of 0.002 s, got nan": {"control_step": math.nan},
         "speed must lie above 0": {"speed": 0},
     }
     for message, arguments in cases.items():
@@ -339,6 +353,64 @@ def test_simulation_checks_what_it_is_given(torcs):
         Simulation("g-track-3", skill_level=7)
 
 
+@pytest.mark.parametrize("reading", ["angle", "heading", "track_pos", "distance"])
+def test_no_reading_without_a_road(torcs, reading):
+    """TORCS itself would read from address 0, or from a track that was given back."""
+    simulation = Simulation("g-track-3")
+    with pytest.raises(RuntimeError, match="place"):
+        getattr(simulation, reading)
+    simulation.place(0.0)
+    assert math.isfinite(getattr(simulation, reading))
+    simulation.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        getattr(simulation, reading)
+
+
+def test_places_off_the_road_and_factors_out_of_range(torcs):
+    simulation = Simulation("g-track-3")
+    for place in ((0.0, 1.5), (0.0, -1e9), (0.0, 0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1e30)):
+        with pytest.raises(ValueError, match="placed on the road"):
+            simulation.place(*place)
+    for factors in ({"fuel_factor": math.nan}, {"damage_factor": -1.0}, {"damage_factor": 1e30}):
+        with pytest.raises(ValueError, match="_factor must lie in"):
+            Simulation("g-track-3", **factors)
+
+
+@pytest.mark.skipif(shutil.which("localedef") is None, reason="localedef is not there to make a locale")
+def test_a_locale_with_a_decimal_comma(torcs, tmp_path):
+    """TORCS reads numbers with strtod, to which "0.5" is then 0: Wheel-2 would be 53 m shorter."""
+    made = subprocess.run(
+        ["localedef", "-i", "de_DE", "-f", "UTF-8", str(tmp_path / "de_DE.UTF-8")], capture_output=True, check=False
+    )
+    if not (tmp_path / "de_DE.UTF-8" / "LC_NUMERIC").is_file():
+        pytest.skip(f"localedef makes no de_DE here: {made.stderr.decode().strip()[:100]}")
+    code = (
+        "import locale; locale.setlocale(locale.LC_ALL, 'de_DE.UTF-8')\n"
+        "from sb3_sap.envs.torcs.simulation import Simulation\n"
+        "print(Simulation('wheel-2').length, locale.localeconv()['decimal_point'])"
+    )
+    environment = {**os.environ, "LOCPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["6205.462890625", ","]
+
+
+def test_every_car_shifts(torcs):
+    """The engines' red lines lie between 576 and 1,958 rad/s: gears go by the car's own."""
+    simulation = Simulation("g-track-3", "car1-ow1")
+    simulation.place(0.0)
+    assert simulation.top_gear == 7
+    simulation.control(0.0, 1.0, gear=7)
+    for car in ("car1-trb1", "p406", "buggy"):
+        simulator = TorcsSimulator("a-speedway", speed=90.0, car=car)
+        simulator.reset(50.0, 0.0, 0.0)
+        gears = set()
+        for _ in range(25):
+            simulator.step(0.0)
+            gears.add(simulator.simulation.gear)
+        assert max(gears) > 1, car
+        simulator.close()
+
+
 def test_nothing_installed(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("TORCS_ROOT", str(tmp_path))
     with pytest.raises(TorcsNotFoundError, match=r"no TORCS in TORCS_ROOT=.*sb3-sap torcs install"):
@@ -376,6 +448,33 @@ def test_damaged_car(copy_of_torcs):
     car.write_text(whole.replace('name="category"', 'name="kategorie"'))
     with pytest.raises(ValueError, match="names no category"):
         Simulation("g-track-3", installation=copy_of_torcs)
+
+
+def test_damaged_surfaces(copy_of_torcs):
+    copy_of_torcs.surfaces().write_text("")
+    with pytest.raises(ValueError, match=r"surfaces.xml, the road surfaces, is not the one"):
+        Simulation("g-track-3", installation=copy_of_torcs)
+
+
+def test_a_track_without_a_road_leaves_no_trace(torcs, tmp_path):
+    """TORCS builds this one without a segment; the copy of the library that did so must not be used again."""
+    path = tmp_path / "empty.xml"
+    path.write_bytes(flatten(torcs.track("eroad")).replace(b'name="Header"', b'name="a/b"'))
+    code = (
+        "from sb3_sap.envs.torcs.simulation import Simulation\n"
+        f"try: Simulation({str(path)!r})\n"
+        "except ValueError as error: print(error)\n"
+        "Simulation('eroad').place(0.0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "empty.xml" in done.stdout
+
+
+def test_a_trial_that_ends_early_fails():
+    assert survives(lambda: None) is None
+    assert survives(lambda: 1 / 0) == "gives up"
+    assert survives(lambda: os._exit(0)) == "gives up"
 
 
 def test_a_track_of_ones_own(torcs, tmp_path):

@@ -83,6 +83,10 @@ class Installation:
             )
         return path
 
+    def surfaces(self) -> Path:
+        """The file of the road surfaces, which the tracks share."""
+        return self.root / DATA / "data/tracks/surfaces.xml"
+
     def is_original(self, path: Path) -> bool:
         """Whether a file is, to the byte, one that TORCS ships."""
         return path.is_relative_to(self.root) and digest(path) == checksums().get(path.relative_to(self.root))

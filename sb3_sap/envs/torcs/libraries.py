@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import locale
 import os
 import shutil
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,25 @@ MERGE_ALL = 15
 """GfParmMergeHandles: sources and parameters of both, the handles released."""
 
 
+_reading = threading.RLock()
+_making = threading.Lock()
+
+
+@contextmanager
+def reading() -> Iterator[None]:
+    """Lets one thread at a time into TORCS' parser, which is global, and gives it the decimal point it expects.
+
+    TORCS reads numbers with strtod: in a locale with a decimal comma "0.5" would silently be 0.
+    """
+    with _reading:
+        before = locale.setlocale(locale.LC_NUMERIC)
+        locale.setlocale(locale.LC_NUMERIC, "C")
+        try:
+            yield
+        finally:
+            locale.setlocale(locale.LC_NUMERIC, before)
+
+
 class Shared:
     """The functions of the libraries that every simulation of a process shares."""
 
@@ -31,6 +53,7 @@ class Shared:
         string, pointer = ctypes.c_char_p, ctypes.c_void_p
         self.read_parameters = _function(tgf, "_Z14GfParmReadFilePKci", pointer, string, ctypes.c_int)
         self.merge = _function(tgf, "_Z18GfParmMergeHandlesPvS_i", pointer, pointer, pointer, ctypes.c_int)
+        self.release_parameters = _function(tgf, "_Z19GfParmReleaseHandlePv", None, pointer)
         self.to_global = _function(
             tools, "_Z19RtTrackLocal2GlobalP10tTrkLocPosPfS1_i", None, _Position, _Float, _Float, ctypes.c_int
         )
@@ -80,9 +103,14 @@ class LibraryPool:
             self._free.append(library)
 
 
-@cache
 def pool(installation: Installation) -> LibraryPool:
     """The pool of this process."""
+    with _making:  # two threads would initialise the shared libraries twice
+        return _pool(installation)
+
+
+@cache
+def _pool(installation: Installation) -> LibraryPool:
     return LibraryPool(installation)
 
 

@@ -14,10 +14,12 @@ from collections.abc import Callable
 
 TIME_LIMIT = 10
 """s after which a trial is given up."""
+SURVIVED = 42
+"""Exit status of a trial that came to its end; TORCS ends a process with 0 or 1."""
 
 
 def survives(trial: Callable[[], object]) -> str | None:
-    """Runs a trial in a forked child and says how it died, or None if it lived; exceptions are no death."""
+    """Runs a trial in a forked child and says how it failed, or None if it came to its end."""
     with warnings.catch_warnings():
         # Newer Pythons warn of forking beside threads; this child calls C code alone and leaves at once.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -26,12 +28,14 @@ def survives(trial: Callable[[], object]) -> str | None:
         _run(trial)
     _, status = os.waitpid(child, 0)
     if not os.WIFSIGNALED(status):
-        return None
+        # Not its end either: an exception, or TORCS ending the process. It would happen here again.
+        return None if os.WEXITSTATUS(status) == SURVIVED else "gives up"
     number = os.WTERMSIG(status)
     return "does not return" if number == signal.SIGALRM else f"crashes ({signal.Signals(number).name})"
 
 
 def _run(trial: Callable[[], object]) -> None:
+    status = 1
     try:
         faulthandler.disable()  # a crash is expected, and told by the parent
         silence = os.open(os.devnull, os.O_WRONLY)
@@ -40,5 +44,6 @@ def _run(trial: Callable[[], object]) -> None:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(TIME_LIMIT)
         trial()
+        status = SURVIVED
     finally:
-        os._exit(0)
+        os._exit(status)

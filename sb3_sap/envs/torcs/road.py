@@ -6,7 +6,7 @@ import tempfile
 from bisect import bisect_right
 from typing import Any, NamedTuple
 
-from sb3_sap.envs.torcs.libraries import Private
+from sb3_sap.envs.torcs.libraries import Private, reading
 from sb3_sap.envs.torcs.structures import STRAIGHT, TrackSegment, TrackStructure
 
 
@@ -39,7 +39,11 @@ class Road:
         with tempfile.NamedTemporaryFile(suffix=".xml") as file:
             file.write(document)
             file.flush()
-            self.structure: Any = TrackStructure.from_address(library.build_track(file.name.encode()))
+            with reading():
+                address = library.build_track(file.name.encode())
+        self.structure: Any = TrackStructure.from_address(address) if address else None
+        if self.structure is None or not self.structure.last_segment:
+            raise ValueError("TORCS builds no road from the track file: compare it with one that TORCS ships.")
         self.length: float = self.structure.length
         self.segments = self._read_segments()
         self.at_address = {segment.address: segment for segment in self.segments}

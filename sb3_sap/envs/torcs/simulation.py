@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_sap.envs.torcs.installation import Installation, find_installation
-from sb3_sap.envs.torcs.libraries import MERGE_ALL, READ_STANDARD, pool
+from sb3_sap.envs.torcs.libraries import MERGE_ALL, READ_STANDARD, pool, reading
 from sb3_sap.envs.torcs.probe import survives
 from sb3_sap.envs.torcs.road import Road, Segment
 from sb3_sap.envs.torcs.structures import (
@@ -31,6 +31,12 @@ SETTLE_TICKS = 500
 MAX_DAMAGE = 10_000
 SKILL_LEVELS = range(4)
 """0 rookie to 3 pro; the level changes the grip of the tyres."""
+MAX_GEAR = 8
+"""What TORCS has room for; a car ignores gears that it lacks."""
+MAX_FACTOR = 100.0
+"""Of fuel and damage."""
+MAX_TRACK_POS, MAX_HEIGHT = 1.0, 10.0
+"""A car is placed on the road, and at most so many metres above it."""
 TRIAL_PLACES, TRIAL_TICKS = 40, 100
 """Where, and how long, files that TORCS does not ship are tried out."""
 
@@ -61,11 +67,20 @@ class Simulation:
         installation = installation or find_installation()
         if skill_level not in SKILL_LEVELS:
             raise ValueError(f"skill_level must be from 0 (rookie) to 3 (pro), got {skill_level!r}.")
+        for name, factor in (("fuel_factor", fuel_factor), ("damage_factor", damage_factor)):
+            if not 0 <= factor <= MAX_FACTOR:
+                raise ValueError(f"{name} must lie in [0, {MAX_FACTOR:g}], got {factor!r}.")
         path = Path(track)
         self.track_path = path if path.suffix == ".xml" and path.is_file() else installation.track(str(track))
         track_file = flatten(self.track_path)
         car_file = installation.car(car)
         category_file = installation.category(car_category(car_file))
+        surfaces = installation.surfaces()
+        if surfaces.is_file() and not installation.is_original(surfaces):
+            # It would load, with another grip on every track.
+            raise ValueError(
+                f"{surfaces}, the road surfaces, is not the one that TORCS ships: install TORCS' data again."
+            )
         unknown = [f for f in (self.track_path, car_file, category_file) if not installation.is_original(f)]
         if unknown and not _trial:
             options = track, car, skill_level, fuel_factor, damage_factor, installation
@@ -87,12 +102,13 @@ class Simulation:
         self._make_structures()
 
     def _read_car(self, car_file: Path, category_file: Path) -> Any:
-        handles = [
-            self._shared.read_parameters(str(file).encode(), READ_STANDARD) for file in (category_file, car_file)
-        ]
-        if not all(handles):
-            raise ValueError(f"TORCS cannot read {car_file} with {category_file}: install TORCS' data again.")
-        return self._shared.merge(*handles, MERGE_ALL)
+        with reading():
+            handles = [
+                self._shared.read_parameters(str(file).encode(), READ_STANDARD) for file in (category_file, car_file)
+            ]
+            if not all(handles):
+                raise ValueError(f"TORCS cannot read {car_file} with {category_file}: install TORCS' data again.")
+            return self._shared.merge(*handles, MERGE_ALL)
 
     def _make_structures(self) -> None:
         self.car: Any = CarStructure()
@@ -115,13 +131,19 @@ class Simulation:
         """Puts the car, at rest, on the road and lets it settle.
 
         :param distance: m along the centre line from the start line
-        :param track_pos: +1 is the left edge
+        :param track_pos: in [-1, 1]; +1 is the left edge
         :param angle: rad, road heading minus yaw
         :param height: m above the road from which it is dropped
         """
         self._check_open()
         if not all(map(math.isfinite, (distance, track_pos, angle, height))):
             raise ValueError(f"A car can only be placed at finite numbers, got {(distance, track_pos, angle, height)}.")
+        if abs(track_pos) > MAX_TRACK_POS or not 0 <= height <= MAX_HEIGHT:
+            # Far off the road TORCS' numbers turn into NaN.
+            raise ValueError(
+                f"A car is placed on the road, at a track_pos in [-{MAX_TRACK_POS:g}, {MAX_TRACK_POS:g}] and a height "
+                f"in [0, {MAX_HEIGHT:g}] m, got {track_pos!r} and {height!r}."
+            )
         distance %= self.length
         segment = self.road.segment(distance)
         if self._running:
@@ -138,7 +160,7 @@ class Simulation:
         self._shared.to_global(self._at, ctypes.byref(x), ctypes.byref(y), 0)
         self._pose[0], self._pose[1] = x.value, y.value
         self._pose[2] = self._shared.height(self._at) + height
-        self._pose[5] = (self.heading - angle) % (2 * math.pi)
+        self._pose[5] = (self._shared.heading(self._at) - angle) % (2 * math.pi)
         self._situation.race_state, self._situation.current_time = PLACED, 0.0
         self._library.init(1, ctypes.addressof(self.road.structure), *self._factors)
         self._running = True
@@ -157,10 +179,14 @@ class Simulation:
         :param gear: -1 (reverse) to the highest
         """
         if not (
-            -1 <= steer <= 1 and 0 <= accelerator <= 1 and 0 <= brake <= 1 and 0 <= clutch <= 1 and -1 <= gear <= 6
+            -1 <= steer <= 1
+            and 0 <= accelerator <= 1
+            and 0 <= brake <= 1
+            and 0 <= clutch <= 1
+            and -1 <= gear <= MAX_GEAR
         ):
             raise ValueError(
-                "Controls must lie in -1..1 (steer), 0..1 (accelerator, brake, clutch) and -1..6 (gear), got "
+                f"Controls must lie in -1..1 (steer), 0..1 (accelerator, brake, clutch) and -1..{MAX_GEAR} (gear), got "
                 f"{steer}, {accelerator}, {brake}, {clutch}, {gear}."
             )
         car = self.car
@@ -168,8 +194,7 @@ class Simulation:
 
     def advance(self, ticks: int, race_state: int = RUNNING) -> None:
         """Advances the physics by a number of ticks of 2 ms."""
-        if not self._running:
-            raise RuntimeError("The car stands on no road yet, or the simulation is closed: call `place` first.")
+        self._check_running()
         self._situation.race_state = race_state
         update, situation = self._library.update, ctypes.addressof(self._situation)
         for _ in range(ticks):
@@ -189,6 +214,7 @@ class Simulation:
     @property
     def heading(self) -> float:
         """Heading of the road where the car is, rad."""
+        self._check_running()  # without a segment TORCS would read from address 0
         return self._shared.heading(self._at)  # type: ignore[no-any-return]
 
     @property
@@ -224,14 +250,28 @@ class Simulation:
         return self.car.gear  # type: ignore[no-any-return]
 
     @property
+    def red_line(self) -> float:
+        """Highest speed of the car's engine, rad/s."""
+        return self.car.red_line  # type: ignore[no-any-return]
+
+    @property
+    def top_gear(self) -> int:
+        """The car's highest gear."""
+        return self.car.n_gears - 1  # type: ignore[no-any-return]
+
+    def gear_step(self, gear: int) -> float:
+        """How many times faster the engine turns one gear lower; ``gear`` from 2."""
+        ratios = self.car.gear_ratios
+        return ratios[gear] / ratios[gear + 1]  # type: ignore[no-any-return]
+
+    @property
     def damage(self) -> int:
         """Damage points."""
         return self.car.damage  # type: ignore[no-any-return]
 
     @property
     def _segment(self) -> Segment:
-        if not self._running:
-            raise RuntimeError("The car stands on no road yet, or the simulation is closed: call `place` first.")
+        self._check_running()
         return self.road.at_address[self._position.segment]
 
     def drive_everywhere(self) -> None:
@@ -250,14 +290,20 @@ class Simulation:
         if self._running:
             library.shutdown()
             self._running = False
-        if hasattr(self, "road"):  # else the track was never built
+        with reading():
+            self._shared.release_parameters(self._car_handle)
+        if hasattr(self, "road"):  # else the track is half built, and the next one in this copy would crash
             library.close_track()
-        self._pool.release(library)
+            self._pool.release(library)
 
     def __del__(self) -> None:
         # Environments are often dropped without being closed; the libraries go back all the same.
         if getattr(self, "_library", None) is not None:
             self.close()
+
+    def _check_running(self) -> None:
+        if not self._running:
+            raise RuntimeError("The car stands on no road yet, or the simulation is closed: call `place` first.")
 
     def _check_open(self) -> None:
         if self._library is None:

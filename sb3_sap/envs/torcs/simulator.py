@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -40,7 +41,7 @@ class TorcsSimulator:
             raise ValueError(f"start must be one of {', '.join(map(repr, STARTS))}, got {start!r}.")
         if not 0 < speed <= 300:
             raise ValueError(f"speed must lie above 0 and not above 300 km/h, got {speed!r}.")
-        ticks = round(control_step / TICK)
+        ticks = round(control_step / TICK) if 0 < control_step < math.inf else 0
         if ticks < 1 or abs(ticks * TICK - control_step) > 1e-9:
             raise ValueError(f"control_step must be a positive multiple of {TICK} s, got {control_step!r}.")
         self.simulation = Simulation(track, car)
@@ -73,7 +74,7 @@ class TorcsSimulator:
         """Drive one control step at no default speed: pedal from -1, full brake, to 1, full throttle."""
         simulation, throttle = self.simulation, self._throttle
         for ticks in self._periods:
-            simulation.control(steering, max(pedal, 0.0), max(-pedal, 0.0), gear=throttle.gear(simulation.engine_speed))
+            simulation.control(steering, max(pedal, 0.0), max(-pedal, 0.0), gear=throttle.gear(simulation))
             simulation.advance(ticks)
         return self._state()
 

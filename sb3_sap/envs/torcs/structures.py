@@ -85,6 +85,9 @@ CarStructure = _structure(
         "gear": (840 + 504, ctypes.c_int),
         "fuel": (840 + 508, ctypes.c_float),  # l
         "engine_speed": (840 + 512, ctypes.c_float),  # rad/s
+        "red_line": (840 + 516, ctypes.c_float),  # rad/s, of the engine
+        "gear_ratios": (840 + 540, ctypes.c_float * 10),  # of reverse, neutral, 1, 2, …
+        "n_gears": (840 + 580, ctypes.c_int),  # neutral included
         "damage": (840 + 656, ctypes.c_int),
         "steer": (1536, ctypes.c_float),
         "accelerator": (1540, ctypes.c_float),

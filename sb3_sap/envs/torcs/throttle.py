@@ -16,8 +16,8 @@ BRAKE_GAIN = 0.05
 """… by so much per km/h."""
 SLIP = 5.0
 """rad/s. While the rear wheels together spin so much faster than the front wheels, the throttle is halved."""
-SHIFT_UP, SHIFT_DOWN = 800.0, 350.0
-"""rad/s, engine speeds at which the gear changes …"""
+SHIFT_UP, SHIFT_DOWN = 0.835, 0.7
+"""Fractions of the engine's red line: shift up above the first, down where the lower gear stays below the second …"""
 SHIFT_TIME = 0.5
 """… and s for which it then stays."""
 PERIOD = 0.02
@@ -51,13 +51,16 @@ class SpeedHolder:
         if rear_right + rear_left - front_right - front_left > SLIP:
             throttle /= 2
         brake = min(max(BRAKE_GAIN * (-lack - BRAKE_MARGIN), 0.0), 1.0)
-        return throttle, brake, self.gear(simulation.engine_speed)
+        return throttle, brake, self.gear(simulation)
 
-    def gear(self, engine_speed: float) -> int:
-        """The gear of the next period, shifted by the engine's speed [rad/s]."""
+    def gear(self, simulation: Simulation) -> int:
+        """The gear of the next period, shifted by the engine's speed."""
         self._since_shift += PERIOD
         if self._since_shift >= SHIFT_TIME:
-            step = (engine_speed > SHIFT_UP and self._gear < 6) - (engine_speed < SHIFT_DOWN and self._gear > 1)
+            revs = simulation.engine_speed / simulation.red_line
+            up = revs > SHIFT_UP and self._gear < simulation.top_gear
+            down = self._gear > 1 and revs * simulation.gear_step(self._gear) < SHIFT_DOWN
+            step = up - down
             if step:
                 self._gear += step
                 self._since_shift = 0.0

@@ -1,5 +1,6 @@
 """TORCS in process. Without TORCS these are skipped; with SB3_SAP_REQUIRE_TORCS set, as in CI, they must run."""
 
+import contextlib
 import gc
 import json
 import math
@@ -515,9 +516,10 @@ def test_no_track_file_kills_the_process(torcs, tmp_path_factory, data):
     path.write_text("\n".join(lines))
 
     def build_and_drive():
-        simulation = Simulation(path)
-        simulation.drive_everywhere()
-        simulation.close()
+        with contextlib.suppress(Exception):
+            simulation = Simulation(path)
+            simulation.drive_everywhere()
+            simulation.close()
 
     assert survives(build_and_drive) is None
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,11 +55,12 @@ class Run:
 
 
 class TrainingLog(BaseCallback):
-    """Collects one row of a tidy table for every training step."""
+    """Collects one row of a tidy table for every training step, and ends the training when it is told to."""
 
     def __init__(self) -> None:
         super().__init__()
         self.rows: list[dict[str, Any]] = []
+        self.stop = False
 
     def _on_step(self) -> bool:
         [info], [reward] = self.locals["infos"], self.locals["rewards"]
@@ -72,7 +76,26 @@ class TrainingLog(BaseCallback):
                 "alpha": getattr(self.model, "current_alpha", float("nan")),
             }
         )
-        return True
+        return not self.stop
+
+
+@contextmanager
+def ctrl_c_stops(log: TrainingLog) -> Iterator[None]:
+    """Ends the training after the step in which Ctrl-C was pressed, and only then interrupts.
+
+    An exception in the middle of a step can be lost in a destructor, or leave a buffer half written.
+    """
+
+    def stop(*_: object) -> None:
+        log.stop = True
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if log.stop:
+        raise KeyboardInterrupt
 
 
 def demo(run: Run, console: Console) -> list[LapResult]:
@@ -80,10 +103,13 @@ def demo(run: Run, console: Console) -> list[LapResult]:
     env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
     settings = preset(run.preset, run.algo, run.steps)
     model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
-    console.print(f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {run.preset!r})")
     log = TrainingLog()
     try:
-        model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
+        with ctrl_c_stops(log):
+            console.print(
+                f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {run.preset!r})"
+            )
+            model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
     finally:
         # Ctrl-C included: what was learned so far stays.
         with atomic_path(run.out / "model.zip") as temporary:

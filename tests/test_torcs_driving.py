@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_sap.envs.torcs.driving import LOOK_AHEAD, ap_function, lateral_velocity, too_fast
+from sb3_sap.envs.torcs.driving import LOOK_AHEAD, ap_function, dawdles, lateral_velocity, too_fast
 
 N_OBS = 6 + len(LOOK_AHEAD)
 
@@ -50,6 +50,21 @@ def test_too_fast_for_the_curve_ahead():
     assert not permissible(observe(speed=115, radius_ahead=10), observe(speed=116, radius_ahead=10))
     assert permissible(observe(speed=115, radius_ahead=10), observe(speed=114, radius_ahead=10))
     assert permissible(observe(speed=113, radius_ahead=10), observe(speed=116, radius_ahead=10))
+
+
+def test_dawdling():
+    # 3 m/s² hold a curve of 12 m radius at 6 m/s = 21.6 km/h: slower than that nobody needs to be.
+    assert dawdles(observe(speed=21, radius_ahead=12))[0]
+    assert not dawdles(observe(speed=22, radius_ahead=12))[0]
+    assert not permissible(observe(speed=21, radius_ahead=12), observe(speed=20, radius_ahead=12))
+    assert permissible(observe(speed=21, radius_ahead=12), observe(speed=21.5, radius_ahead=12))
+    assert permissible(observe(speed=23, radius_ahead=12), observe(speed=22, radius_ahead=12))
+    # On a straight of 150 m: √(2 · 3 · 150) = 30 m/s = 108 km/h can be stopped within sight.
+    assert dawdles(observe(speed=107))[0]
+    assert not dawdles(observe(speed=109))[0]
+    # badly placed, slowing down may be right
+    assert permissible(observe(0.6, 0.0, 21, radius_ahead=12), observe(0.6, 0.0, 20, radius_ahead=12))
+    assert permissible(observe(0.0, 0.3, 21, radius_ahead=12), observe(0.0, 0.3, 20, radius_ahead=12))
 
 
 def test_labels_are_one_per_row():

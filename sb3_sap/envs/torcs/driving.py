@@ -19,6 +19,10 @@ CURVATURE_LIMIT = 5.0
 """Largest magnitude of an observed curvature, in those units."""
 MAX_ACCELERATION = 20.0
 """m/s². More than the tyres can give in any direction (about 1.5 g): what it cannot do cannot be done."""
+SURE_ACCELERATION = 3.0
+"""m/s². Less than the tyres give on any road (about 0.3 g): what this can do is always possible."""
+SURE_ANGLE, SURE_TRACK_POS = 0.2, 0.5
+"""rad and half widths within which a car is well placed."""
 EDGE_TIME = 1.0
 """s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
 KMH = 3.6
@@ -35,16 +39,18 @@ def lateral_velocity(obs: NDArray[Any]) -> NDArray[Any]:
 
 
 def ap_function(obs: NDArray[Any], actions: NDArray[Any], next_obs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Two mistakes that no fast lap contains; each is judged where the step began and confirmed by what it led to.
+    """Three mistakes that no fast lap contains; each is judged where the step began and confirmed by what it led to.
 
     1. *Running wide*: at its lateral speed the car reaches the edge within a second, and the step made that
        lateral speed larger. Leaving the road ends the episode, so the speed must be taken back, and the later
        the more it costs.
     2. *Too fast for what lies ahead*: even tyres better than the car's could not brake from here to a speed that holds
        the road at some point ahead, and the step made the car faster still.
+    3. *Dawdling*: well placed on the road, the car is slower than even poor tyres would hold through everything that
+       is in sight, and the step made it slower still.
 
-    Both are sound only as far as their constants are: `MAX_ACCELERATION` lies above what the tyres give, so the second
-    forbids nothing possible; the first may in principle forbid a short cut along the edge.
+    They are sound as far as their constants are: the second forbids nothing possible and the third nothing useful, as
+    the tyres lie between the two accelerations; the first may in principle forbid a short cut along the edge.
 
     :param obs: (n, 14) as the environment returns them
     :param actions: (n, 2)
@@ -56,7 +62,9 @@ def ap_function(obs: NDArray[Any], actions: NDArray[Any], next_obs: NDArray[Any]
     room = (1 - np.abs(next_obs[:, 1])) * next_obs[:, HALF_WIDTH][:, 0] * WIDTH_SCALE  # m to the edge
     faster_outward = outward > lateral_velocity(obs) * np.sign(next_obs[:, 1])
     runs_wide = (outward > 0) & (room < outward * EDGE_TIME) & faster_outward
-    return ~(runs_wide | (too_fast(obs) & (next_obs[:, 2] > obs[:, 2])))  # type: ignore[no-any-return]
+    faster = next_obs[:, 2] > obs[:, 2]
+    slower = next_obs[:, 2] < obs[:, 2]
+    return ~(runs_wide | (too_fast(obs) & faster) | (dawdles(obs) & slower))  # type: ignore[no-any-return]
 
 
 def too_fast(obs: NDArray[Any]) -> NDArray[np.bool_]:
@@ -66,6 +74,16 @@ def too_fast(obs: NDArray[Any]) -> NDArray[np.bool_]:
     holds = MAX_ACCELERATION / np.maximum(curvature, 1e-6)  # v² at which the tyres still hold the curve
     can_brake = 2 * MAX_ACCELERATION * np.array(LOOK_AHEAD)  # v² that braking takes off on the way there
     return (speed_squared > holds + can_brake).any(axis=1)  # type: ignore[no-any-return]
+
+
+def dawdles(obs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a well placed car is slower than anything in sight asks for; (n,) of (n, obs_dim)."""
+    sharpest = np.abs(obs[:, 5 : 5 + len(LOOK_AHEAD)]).max(axis=1) * CURVATURE_SCALE  # (n,), 1/m
+    speed_squared = (obs[:, 2] * OBSERVATION_SCALE[2] / KMH) ** 2
+    well_placed = (np.abs(obs[:, 0]) < SURE_ANGLE) & (np.abs(obs[:, 1]) < SURE_TRACK_POS)
+    # Beyond sight there may be a hairpin: from a higher speed poor tyres could not stop for it.
+    in_sight = np.minimum(SURE_ACCELERATION / np.maximum(sharpest, 1e-6), 2 * SURE_ACCELERATION * LOOK_AHEAD[-1])
+    return well_placed & (speed_squared < in_sight)  # type: ignore[no-any-return]
 
 
 class DrivingEnv(LaneKeepingEnv):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from gymnasium.utils.env_checker import check_env as check_gymnasium
 from hypothesis import HealthCheck, given, settings
@@ -83,6 +84,17 @@ def test_replays_are_identical_to_the_bit(torcs, name):
     assert found.identical_rows == found.all_columns_identical_rows == found.rows >= 3000
     assert found.first_difference is None
     assert set(found.largest_deviation.values()) == {0.0}
+
+
+def test_replay_takes_commands_from_columns_too(torcs, tmp_path):
+    table = pd.read_csv(TRACES / "eroad.csv.gz", dtype=str).assign(commanded=1)
+    table.to_csv(tmp_path / "eroad.csv.gz", index=False)
+    conditions = json.loads(START.read_text())
+    conditions["traces"]["eroad"]["commands"] = {"gear": "column commanded"}
+    (tmp_path / "start.json").write_text(json.dumps(conditions))
+    assert replay(tmp_path / "eroad.csv.gz", tmp_path / "start.json").identical
+    table.assign(commanded=2).to_csv(tmp_path / "eroad.csv.gz", index=False)
+    assert not replay(tmp_path / "eroad.csv.gz", tmp_path / "start.json").identical
 
 
 def test_replay_notices_a_change(torcs, tmp_path):

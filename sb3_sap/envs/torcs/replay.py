@@ -93,7 +93,7 @@ def replay(trace: Path, start_conditions: Path) -> Comparison:
         common["damage_factor"],
     )
     try:
-        simulated = _drive(simulation, table, own["grid"])
+        simulated = _drive(simulation, table, _controls(table, common | own), own["grid"])
     finally:
         simulation.close()
     # Traces hold 32-bit floats; comparing as such compares bits, but for the sign of a zero.
@@ -120,20 +120,36 @@ def to_json(comparison: Comparison) -> str:
     return json.dumps({row.pop("trace"): row}, indent=2) + "\n"
 
 
-def _drive(simulation: Simulation, table: pd.DataFrame, grid: dict[str, Any]) -> np.ndarray[Any, Any]:
+def _controls(table: pd.DataFrame, conditions: dict[str, Any]) -> list[tuple[float, float, float, float, int]]:
+    """Steer, accelerator, brake, clutch and gear of each row: a column of the trace, or a number for all rows."""
+    commands = {"brake": 0, "clutch": 0, "gear": 1} | conditions.get("commands", {})
+    columns = [table[column].to_numpy(np.float32).astype(float) for column in CONTROLS]
+    for name in ("brake", "clutch", "gear"):
+        command = commands[name]
+        column = command.removeprefix("column ") if isinstance(command, str) else None
+        values = table[column] if column in table else np.full(len(table), command, dtype=float)
+        columns.append(np.asarray(values, dtype=np.float32).astype(float))
+    return [(*row[:4], int(row[4])) for row in zip(*columns, strict=True)]
+
+
+def _drive(
+    simulation: Simulation,
+    table: pd.DataFrame,
+    controls: list[tuple[float, float, float, float, int]],
+    grid: dict[str, Any],
+) -> np.ndarray[Any, Any]:
     """The simulated states, (rows, columns) float32."""
     width = simulation.road.segment(grid["start_pos_m"]).width
     to_middle = grid["to_right_m"] - width / 2
     simulation.place(grid["start_pos_m"], 2 * to_middle / width, height=grid["initial_height_m"])
     simulation.advance(PRESTART_TICKS, PRESTART)
     times = table["t_s"].to_numpy()
-    controls = table[list(CONTROLS)].to_numpy(np.float32).astype(float)
     states = np.empty((len(table), len(STATES)), dtype=np.float32)
-    for i, (steer, accelerator) in enumerate(controls):
+    for i, control in enumerate(controls):
         states[i] = [read(simulation) for read in STATES.values()]
         if i + 1 == len(table):
             break
-        simulation.control(steer, accelerator)
+        simulation.control(*control)
         ticks = round((times[i + 1] - times[i]) / TICK)
         # The last row before the start holds 10 ticks of it, in which the engine zeroes the gear command, and then
         # runs on in neutral: the gear is not set again.

@@ -1,7 +1,19 @@
 """A Stable-Baselines3 extension that learns which actions are permissible while it learns to act."""
 
 from sb3_sap import envs
-from sb3_sap.algorithms import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2, SACAP, TD3AP, TQCAP, CrossQAP
+from sb3_sap.algorithms import (
+    DDPG,
+    DDPGAP,
+    DDPGAPCE2,
+    DDPGCE1,
+    DDPGCE2,
+    DQNAP,
+    QRDQNAP,
+    SACAP,
+    TD3AP,
+    TQCAP,
+    CrossQAP,
+)
 from sb3_sap.buffers import (
     KnowledgeMixin,
     PermissibilityDictReplayBuffer,
@@ -15,6 +27,7 @@ from sb3_sap.exploration import ActionPermissibilityMixin
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import ActionPermissibility
+from sb3_sap.prediction import GuidedPolicy
 from sb3_sap.predictor import PermissibilityPredictor
 
 __version__ = "0.1.0"
@@ -24,6 +37,8 @@ __all__ = [
     "DDPGAPCE2",
     "DDPGCE1",
     "DDPGCE2",
+    "DQNAP",
+    "QRDQNAP",
     "SACAP",
     "TD3AP",
     "TQCAP",
@@ -31,6 +46,7 @@ __all__ = [
     "ActionPermissibilityMixin",
     "ConstrainedExplorationMixin",
     "CrossQAP",
+    "GuidedPolicy",
     "KnowledgeBuffer",
     "KnowledgeMixin",
     "LearnedPermissibilityMixin",

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from sb3_contrib import TQC, CrossQ
+from sb3_contrib import QRDQN, TQC, CrossQ
 from stable_baselines3 import DDPG as PlainDDPG
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import DQN, SAC, TD3
 
 from sb3_sap.constraints import ActionConstraint, ConstrainedExplorationMixin
 from sb3_sap.exploration import ActionPermissibilityMixin
-from sb3_sap.settings import SettingsMixin
 
 #: The lane-keeping rules of section 5.1, by name: the algorithms know no environment.
 CE1 = "sb3_sap.envs.constraint_ce1"
 CE2 = "sb3_sap.envs.constraint_ce2"
 
 
-class DDPG(SettingsMixin, PlainDDPG):
-    """SB3's DDPG with the settings of :class:`~sb3_sap.settings.SettingsMixin`; without them equal to the bit."""
+class DDPG(ConstrainedExplorationMixin, PlainDDPG):
+    """SB3's DDPG with the settings of :class:`~sb3_sap.settings.SettingsMixin` and
+    :class:`~sb3_sap.constraints.ConstrainedExplorationMixin`; without them equal to the bit.
+    """
 
 
 class DDPGAP(ActionPermissibilityMixin, PlainDDPG):
@@ -32,21 +33,21 @@ class DDPGAP(ActionPermissibilityMixin, PlainDDPG):
     """
 
 
-class DDPGCE1(ConstrainedExplorationMixin, PlainDDPG):
+class DDPGCE1(DDPG):
     """DDPG-CE1: on the left of the centre line never steer further left than before, on the right never right."""
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE1, **kwargs: Any):
         super().__init__(*args, constraint=constraint, **kwargs)
 
 
-class DDPGCE2(ConstrainedExplorationMixin, PlainDDPG):
+class DDPGCE2(DDPG):
     """DDPG-CE2: the rule of DDPG-CE1, while the car moves away from the centre line."""
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
         super().__init__(*args, constraint=constraint, **kwargs)
 
 
-class DDPGAPCE2(ActionPermissibilityMixin, PlainDDPG):
+class DDPGAPCE2(DDPGAP):
     """DDPG-(AP+CE2): the rule of DDPG-CE2 bounds the actions, and the candidates that E filters."""
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
@@ -72,4 +73,18 @@ class TQCAP(ActionPermissibilityMixin, TQC):
 class CrossQAP(ActionPermissibilityMixin, CrossQ):
     """CrossQ guided by action permissibility."""
 
+    stochastic_policy: ClassVar[bool] = True
+
+
+class DQNAP(ActionPermissibilityMixin, DQN):
+    """DQN guided by action permissibility: A_st is every action. Its ε-greedy choice is guided, too."""
+
+    discrete: ClassVar[bool] = True
+    stochastic_policy: ClassVar[bool] = True
+
+
+class QRDQNAP(ActionPermissibilityMixin, QRDQN):
+    """QR-DQN guided by action permissibility."""
+
+    discrete: ClassVar[bool] = True
     stochastic_policy: ClassVar[bool] = True

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sap.knowledge import KnowledgeBuffer
-from sb3_sap.permissibility import APFunction, labels_from_function, labels_from_infos
+from sb3_sap.permissibility import APFunction, ask, labels_from_infos
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -45,7 +45,7 @@ class KnowledgeMixin(ReplayBuffer):
         if self.ap_function is None:
             labels = labels_from_infos(infos)
         else:
-            labels = labels_from_function(self.ap_function, obs, self._unscale(action), next_obs)
+            labels = ask(self.ap_function, "ap_function", obs, self._unscale(action), next_obs)
         self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
         super().add(obs, next_obs, action, reward, done, infos)
 

@@ -1,18 +1,20 @@
-"""Hand-made constraints on exploration, the baselines of section 5.1."""
+"""What can be decided before an action is executed: the constraints of section 5.1, and type-2 permissibility."""
 
 from __future__ import annotations
 
 from typing import Any, Protocol, cast
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+from sb3_sap.candidates import candidate_actions, choose
 from sb3_sap.generators import make_rng
-from sb3_sap.permissibility import FloatArray, resolve
-from sb3_sap.settings import SettingsMixin
+from sb3_sap.permissibility import BoolArray, FloatArray, Observations, ask, resolve
+from sb3_sap.settings import SettingsMixin, check_at_least
 
 
 class ActionConstraint(Protocol):
@@ -27,21 +29,54 @@ class ActionConstraint(Protocol):
     def __call__(self, obs: Any, previous_obs: Any, last_action: Any, /) -> tuple[Any, Any]: ...
 
 
-class ConstrainedExplorationMixin(SettingsMixin):
-    """Replaces actions outside an interval by uniform draws from it (section 5.1, DDPG-CE1 and -CE2).
+class PermissibleActions(Protocol):
+    """Type-2 permissibility: which of a batch of actions may be executed, told by the state alone.
 
-    :param constraint: an :class:`ActionConstraint`, or its dotted name; asked from the second step of an episode on
+    :param obs: raw (never normalised) observations, (n, *obs_shape)
+    :param actions: in the units of the environment's action space, (n, *action_shape)
+    :return: (n,) bool
     """
 
-    def __init__(self, *args: Any, constraint: ActionConstraint | str | None = None, **kwargs: Any):
+    def __call__(self, obs: Observations, actions: np.ndarray[Any, Any], /) -> BoolArray: ...
+
+
+class ConstrainedExplorationMixin(SettingsMixin):
+    """Replaces, while training, actions that a rule forbids by uniform draws from those that it allows.
+
+    :param constraint: an :class:`ActionConstraint`, or its dotted name; asked from the second step of an episode on
+        (section 5.1, DDPG-CE1 and -CE2)
+    :param permissible_actions: a :class:`PermissibleActions`, or its dotted name; asked at every step. Where it allows
+        none of the candidates, the action stays as it is
+    :param n_candidates: N of line 8, the size of A_st; a finite action space is taken whole
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        constraint: ActionConstraint | str | None = None,
+        permissible_actions: PermissibleActions | str | None = None,
+        n_candidates: int = 128,
+        **kwargs: Any,
+    ):
         self.constraint = constraint
+        self.permissible_actions = permissible_actions
+        self.n_candidates = n_candidates
         self._rng = cast(np.random.Generator, None)  # made in set_random_seed, kept by save and load
         self._previous: list[tuple[Any, Any] | None] = []  # (raw obs, executed action) of each environment
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         saved_rng = self._rng
-        self._constraint = None if self.constraint is None else resolve(self.constraint, "constraint")
+        check_at_least(self, n_candidates=1)
+        self._constraint, self._permissible_actions = (
+            None if rule is None else resolve(rule, name)
+            for name, rule in (("constraint", self.constraint), ("permissible_actions", self.permissible_actions))
+        )
+        if self._constraint is not None and isinstance(self.action_space, spaces.Discrete):
+            raise ValueError(
+                "`constraint` is an interval of continuous actions, but this action space is "
+                f"{self.action_space}: say what is allowed with `permissible_actions`."
+            )
         super()._setup_model()
         # Without a seed SB3 leaves its generators alone; `load` has restored ours already.
         self._rng = saved_rng or self._rng or make_rng(None, "exploration")
@@ -67,14 +102,43 @@ class ConstrainedExplorationMixin(SettingsMixin):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
         action, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
-        if self._constraint is None:
-            return action, scaled
-        low, high = self._allowed_interval(n_envs)
-        outside = ((scaled < low) | (scaled > high)).reshape(n_envs, -1).any(axis=1)
-        if outside.any():
-            scaled[outside] = self._rng.uniform(low[outside], high[outside])
-            action = self.policy.unscale_action(scaled)
+        if self._constraint is not None:
+            low, high = self._allowed_interval(n_envs)
+            outside = ((scaled < low) | (scaled > high)).reshape(n_envs, -1).any(axis=1)
+            if outside.any():
+                scaled[outside] = self._rng.uniform(low[outside], high[outside])
+                action = self._unscale(scaled)
+        if self._permissible_actions is not None:
+            forbidden = np.flatnonzero(~self._allowed(self._raw_last_obs(), scaled))
+            if len(forbidden):
+                candidates, allowed = self._candidates(forbidden, n_envs)
+                some = allowed.any(axis=1)
+                if some.any():
+                    chosen = choose(self._rng, candidates[some], allowed[some], scores=None)
+                    scaled[forbidden[some]] = chosen.reshape(-1, *scaled.shape[1:])
+                    action = self._unscale(scaled)
         return action, scaled
+
+    def _candidates(self, rows: np.ndarray[Any, Any], n_envs: int) -> tuple[np.ndarray[Any, Any], BoolArray]:
+        """A_st of m of the environments, (m, N, action_dim) scaled, and which of them the rules allow, (m, N)."""
+        low, high = (bound.reshape(n_envs, -1)[rows] for bound in self._allowed_interval(n_envs))
+        candidates = candidate_actions(self._rng, self.action_space, low, high, self.n_candidates)
+        return candidates, self._allowed_candidates(rows_of(self._raw_last_obs(), rows), candidates)
+
+    def _allowed_candidates(self, raw_obs: Any, candidates: np.ndarray[Any, Any]) -> BoolArray:
+        m, n, _ = candidates.shape
+        if self._permissible_actions is None:
+            return np.ones((m, n), dtype=bool)
+        every = rows_of(raw_obs, np.repeat(np.arange(m), n))
+        return self._allowed(every, candidates.reshape(m * n, *cast(Any, self.action_space).shape)).reshape(m, n)
+
+    def _allowed(self, raw_obs: Any, scaled: np.ndarray[Any, Any]) -> BoolArray:
+        assert self._permissible_actions is not None
+        return ask(self._permissible_actions, "permissible_actions", raw_obs, self._unscale(scaled))
+
+    def _unscale(self, scaled: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """Scaled actions in the environment's units; those of a finite space are their own."""
+        return scaled if isinstance(self.action_space, spaces.Discrete) else self.policy.unscale_action(scaled)
 
     def _allowed_interval(self, n_envs: int) -> tuple[FloatArray, FloatArray]:
         """The scaled actions that the constraint allows now: low and high, each (n_envs, *action_shape)."""
@@ -83,7 +147,7 @@ class ConstrainedExplorationMixin(SettingsMixin):
         if self._constraint is not None:
             for i, previous in enumerate(self._previous):
                 if previous is not None:
-                    interval = self._constraint(_row(self._raw_last_obs(), i), *previous)
+                    interval = self._constraint(rows_of(self._raw_last_obs(), i), *previous)
                     # An interval may reach beyond the action space; what counts is the part inside.
                     low[i], high[i] = (np.clip(self.policy.scale_action(np.asarray(b)), -1, 1) for b in interval)
                     if not (low[i] <= high[i]).all():
@@ -104,13 +168,13 @@ class ConstrainedExplorationMixin(SettingsMixin):
     ) -> None:
         if self._constraint is not None:
             obs, executed = self._raw_last_obs(), self.policy.unscale_action(buffer_action)
-            self._previous = [None if done else (_row(obs, i), executed[i]) for i, done in enumerate(dones)]
+            self._previous = [None if done else (rows_of(obs, i), executed[i]) for i, done in enumerate(dones)]
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_constraint", "_previous"]
+        return [*super()._excluded_save_params(), "_constraint", "_permissible_actions", "_previous"]
 
 
-def _row(obs: Any, i: int) -> Any:
-    """The observation of environment i."""
-    return {key: value[i] for key, value in obs.items()} if isinstance(obs, dict) else obs[i]
+def rows_of(obs: Any, rows: Any) -> Any:
+    """Some rows of a batch of observations, or one."""
+    return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]

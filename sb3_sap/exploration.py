@@ -14,23 +14,26 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_sap.actor_loss import permissible_actor_step
-from sb3_sap.constraints import ConstrainedExplorationMixin
+from sb3_sap.candidates import SELECTIONS, choose, q_values
+from sb3_sap.constraints import ConstrainedExplorationMixin, rows_of
 from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import FloatArray
-from sb3_sap.predictor import flush_denormals
+from sb3_sap.prediction import guided_prediction
+from sb3_sap.predictor import candidate_logits, flush_denormals
 
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
     """Guides an SB3 off-policy algorithm with a learned AP predictor (Algorithm 1).
 
-    Goes before the algorithm in the bases of a class. ``predict`` stays the policy alone, so that every evaluation
-    tool of SB3 measures what was learned; both buffers hold the action that was executed.
+    Goes before the algorithm in the bases of a class. ``predict`` stays the policy alone unless it is asked otherwise,
+    so that every evaluation tool of SB3 measures what was learned; both buffers hold the action that was executed.
 
     :param alpha: α, probability of consulting E once it is good enough
     :param alpha_low: the same while E's balanced validation accuracy is below 70 % (the paper gives no value)
     :param t_k: steps with noise and without guidance, counted over the model's whole life. ``None``:
         ``learning_starts``, whose uniform random steps count inside it
-    :param n_candidates: N of line 8, the size of A_st
+    :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
+        "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
     :param actor_permissibility_coef: β of the permissible actor loss, a number or an SB3 schedule; 0 is the paper's
         method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for ``alpha``
 
@@ -47,14 +50,14 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         alpha: float = 0.9,
         alpha_low: float = 0.5,
         t_k: int | None = None,
-        n_candidates: int = 128,
+        candidate_selection: str = "random",
         actor_permissibility_coef: float | Schedule = 0.0,
         **kwargs: Any,
     ):
         self.alpha = alpha
         self.alpha_low = alpha_low
         self.t_k = t_k
-        self.n_candidates = n_candidates
+        self.candidate_selection = candidate_selection
         self.actor_permissibility_coef = actor_permissibility_coef
         self._steps_of_earlier_learns = 0
         super().__init__(*args, **kwargs)
@@ -66,7 +69,16 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
                 raise ValueError(f"`{name}` is a probability from 0 to 1, but is {probability!r}.")
         if self.t_k is not None and self.t_k < 0:
             raise ValueError(f"`t_k` is a number of steps, 0 or more, but is {self.t_k}.")
-        self._check_at_least(n_candidates=1)
+        if self.candidate_selection not in SELECTIONS:
+            raise ValueError(
+                f"`candidate_selection` must be one of {', '.join(map(repr, SELECTIONS))}, but is "
+                f"{self.candidate_selection!r}."
+            )
+        if self.discrete and self.actor_permissibility_coef != 0:
+            raise ValueError(
+                f"`actor_permissibility_coef` = {self.actor_permissibility_coef!r}, but {type(self).__name__} has no "
+                "actor to teach: leave it at 0."
+            )
         if self.noise_steps > self.learning_starts and self.action_noise is None and not self.stochastic_policy:
             warnings.warn(
                 f"`t_k` = {self.t_k} is beyond `learning_starts` = {self.learning_starts}, but there is no "
@@ -123,7 +135,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         if self.predictor.fitted:
             guided = self._guide(scaled)
             if guided is not None:
-                return self.policy.unscale_action(guided), guided
+                return self._unscale(guided), guided
         return action, scaled
 
     @th.no_grad()
@@ -134,10 +146,11 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         :param actions: (n_envs, *action_shape) the actor's actions, scaled
         :return: the same with rejected ones replaced; None where nothing changed
         """
-        shape, actions = actions.shape, actions.reshape(len(actions), -1)
+        shape, n_envs = actions.shape, len(actions)
+        actions = actions.reshape(n_envs, -1)
         self.logger.record("sap/alpha", self.current_alpha)
-        consulted = np.flatnonzero(self._rng.random(len(actions)) < self.current_alpha)  # Alg. 1, line 5
-        self.logger.record_mean("sap/consultation_rate", len(consulted) / len(actions))
+        consulted = np.flatnonzero(self._rng.random(n_envs) < self.current_alpha)  # Alg. 1, line 5
+        self.logger.record_mean("sap/consultation_rate", len(consulted) / n_envs)
         if len(consulted) == 0:
             return None
         obs, _ = self.policy.obs_to_tensor(cast(Any, self._last_obs))
@@ -147,37 +160,44 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         self.logger.record_mean("sap/rejection_rate", len(rejected) / len(consulted))
         if len(rejected) == 0:
             return None
-        low, high = (b.reshape(actions.shape)[rejected] for b in self._allowed_interval(len(actions)))
-        candidates = stratified_candidates(self._rng, low, high, self.n_candidates)  # Alg. 1, line 8
-        permissible = self._permissible(features[rejected], candidates)  # Alg. 1, line 9
+        candidates, allowed = self._candidates(rejected, n_envs)  # Alg. 1, line 8
+        verdicts = candidate_logits(self.predictor, features[rejected], candidates)
+        permissible = allowed & (verdicts > 0)  # Alg. 1, line 9
         found = permissible.any(axis=1)  # Alg. 1, line 10
         self.logger.record_mean("sap/fallback_rate", 1 - found.mean())
+        if not found.any():
+            return None
+        rows = rejected[found]
+        scores = self._scores(rows_of(obs, rows), actions[rows], candidates[found], verdicts[found])
         guided = actions.copy()
-        for i in np.flatnonzero(found):
-            guided[rejected[i]] = self._rng.choice(candidates[i, permissible[i]])  # Alg. 1, line 11
+        guided[rows] = choose(self._rng, candidates[found], permissible[found], scores)  # Alg. 1, line 11
         return guided.reshape(shape)
 
-    def _permissible(self, features: th.Tensor, candidates: FloatArray) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """E's verdict on (n, N, action_dim) candidates for (n, features_dim) features: (n, N) bool."""
-        n, n_candidates, _ = candidates.shape
-        actions = th.as_tensor(candidates, device=self.device).flatten(0, 1)
-        logits = self.predictor.logits(features.repeat_interleave(n_candidates, dim=0), actions)
-        return (logits > 0).cpu().numpy().reshape(n, n_candidates)
+    def _scores(self, obs: Any, actions: Any, candidates: Any, logits: FloatArray) -> FloatArray | None:
+        """What ``candidate_selection`` chooses by, (m, N); None at random."""
+        if self.candidate_selection == "random":
+            return None
+        if self.candidate_selection == "most_permissible":
+            return logits
+        if self.candidate_selection == "nearest":
+            return np.asarray(-np.linalg.norm(candidates - actions[:, None], axis=2))
+        m, n, dim = candidates.shape
+        every = rows_of(obs, np.repeat(np.arange(m), n))
+        q = q_values(self, every, th.as_tensor(candidates.reshape(m * n, dim), device=self.device))
+        return q.cpu().numpy().reshape(m, n)
 
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray[Any, Any], ...] | None = None,
+        episode_start: np.ndarray[Any, Any] | None = None,
+        deterministic: bool = False,
+        guided: bool = False,
+    ) -> tuple[np.ndarray[Any, Any], tuple[np.ndarray[Any, Any], ...] | None]:
+        """SB3's ``predict``.
 
-def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: FloatArray, n: int) -> FloatArray:
-    """Low-variance uniform sampling (section 4.3): one draw from each of n equal strata of every dimension.
-
-    In one dimension the candidates come in ascending order; in more, the strata of the dimensions are paired at
-    random, which is Latin hypercube sampling.
-
-    :param low: (m, action_dim) lower bounds
-    :param high: (m, action_dim) upper bounds
-    :return: (m, n, action_dim) candidates, float32
-    """
-    m, dim = low.shape
-    strata = np.broadcast_to(np.arange(n)[:, None], (m, n, dim))
-    if dim > 1:
-        strata = rng.permuted(strata, axis=1)
-    unit = (strata + rng.random((m, n, dim))) / n  # (m, n, action_dim) in [0, 1)
-    return (low[:, None] + unit * (high - low)[:, None]).astype(np.float32)
+        :param guided: replace an action that ``permissible_actions`` or E rejects by the nearest that they accept
+            (:func:`~sb3_sap.prediction.guided_prediction`)
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        return (guided_prediction(self, observation, actions) if guided else actions), state

@@ -19,7 +19,7 @@ from sb3_sap.generators import make_rng
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, resolve
 from sb3_sap.predictor import PermissibilityPredictor
-from sb3_sap.settings import SettingsMixin
+from sb3_sap.settings import SettingsMixin, check_at_least
 
 #: Validation accuracy from which E is good enough (section 4.3).
 SUFFICIENT_ACCURACY = 0.7
@@ -64,7 +64,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        self._check_at_least(min_per_class=1, dataset_size=2, validation_size=2)
+        check_at_least(self, min_per_class=1, dataset_size=2, validation_size=2)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
@@ -75,11 +75,6 @@ class LearnedPermissibilityMixin(SettingsMixin):
         with th.random.fork_rng(devices=[]):
             th.default_generator.manual_seed(int(make_rng(self.seed, "predictor").integers(2**31)))
             self.predictor = self._make_predictor().to(self.device)
-
-    def _check_at_least(self, **minima: int) -> None:
-        for name, minimum in minima.items():
-            if getattr(self, name) < minimum:
-                raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(self, name)}.")
 
     def _make_replay_buffer(self) -> KnowledgeMixin:
         buffer_class = guided_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)

@@ -89,28 +89,31 @@ def resolve(function: F | str, argument: str) -> F:
     return found  # type: ignore[no-any-return]
 
 
-def labels_from_function(
-    ap_function: APFunction, obs: Observations, actions: np.ndarray[Any, Any], next_obs: Observations
+def ask(
+    function: Callable[..., Any], argument: str, obs: Observations, actions: np.ndarray[Any, Any], *next_obs: Any
 ) -> BoolArray:
-    """Labels a batch with the user's AP function and checks what comes back.
+    """Asks a user's function about a batch of actions and checks what comes back.
 
+    :param argument: the name of the constructor argument that holds the function, for the error messages
+    :param next_obs: s', where the function takes it
     :return: (n,) bool
     """
-    name = getattr(ap_function, "__name__", repr(ap_function))
+    name = getattr(function, "__name__", repr(function))
     n = len(actions)
     try:
-        labels = np.asarray(ap_function(obs, actions, next_obs))
+        labels = np.asarray(function(obs, actions, *next_obs))
     except Exception as error:
+        batches = "(obs, actions, next_obs)" if next_obs else "(obs, actions)"
         raise RuntimeError(
-            f"`ap_function` {name} raised {type(error).__name__}: {error}. It is called with batches "
-            f"(obs, actions, next_obs) of n = {n} rows; here the actions have shape {actions.shape}."
+            f"`{argument}` {name} raised {type(error).__name__}: {error}. It is called with batches "
+            f"{batches} of n = {n} rows; here the actions have shape {actions.shape}."
         ) from error
     if labels.dtype != np.bool_:
         what = "NaN" if labels.dtype.kind == "f" and np.isnan(labels).any() else f"values of type {labels.dtype}"
-        raise TypeError(f"`ap_function` {name} returned {what}, but must return bool: True where permissible.")
+        raise TypeError(f"`{argument}` {name} returned {what}, but must return bool: True where permissible.")
     if labels.shape != (n,):
         raise ValueError(
-            f"`ap_function` {name} returned an array of shape {labels.shape} for {n} actions, but must return "
+            f"`{argument}` {name} returned an array of shape {labels.shape} for {n} actions, but must return "
             f"shape ({n},): one label for each row of the batch."
         )
     return labels

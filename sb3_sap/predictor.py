@@ -17,6 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_sap.knowledge import LabelledActions
+from sb3_sap.permissibility import FloatArray
 
 
 @contextmanager
@@ -38,7 +39,7 @@ def flush_denormals() -> Iterator[None]:
 class PermissibilityPredictor(BaseModel):
     """E(s, a | θ_E): the logit that action a is permissible in state s.
 
-    It sees observations as the policy sees them and actions scaled to [-1, 1].
+    It sees observations as the policy sees them, and actions scaled to [-1, 1] or, of a finite space, one-hot.
 
     :param observation_space: of the environment
     :param action_space: of the environment
@@ -112,7 +113,9 @@ class PermissibilityPredictor(BaseModel):
         return self.extract_features(obs, self.features_extractor)
 
     def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """(n,) logits; above zero means permissible."""
+        """(n,) logits of (n, action_dim) actions; above zero means permissible."""
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = F.one_hot(actions.flatten().long(), int(self.action_space.n))
         # A float64 action space brings float64 actions.
         return self.head(th.cat([features, actions.to(features.dtype)], dim=1)).squeeze(1)  # type: ignore[no-any-return]
 
@@ -156,3 +159,13 @@ class PermissibilityPredictor(BaseModel):
         obs: Any = obs_as_tensor(dataset.observations, self.device)
         actions, labels = (th.as_tensor(array, device=self.device) for array in dataset[1:])
         return obs, actions, labels
+
+
+def candidate_logits(
+    predictor: PermissibilityPredictor, features: th.Tensor, candidates: np.ndarray[Any, Any]
+) -> FloatArray:
+    """E's (m, n) logits of (m, n, action_dim) candidates in m states of (m, features_dim) features, in one call."""
+    m, n, dim = candidates.shape
+    actions = th.as_tensor(np.ascontiguousarray(candidates).reshape(m * n, dim), device=features.device)
+    logits = predictor.logits(features.repeat_interleave(n, dim=0), actions)
+    return logits.cpu().numpy().reshape(m, n)

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch as th
@@ -34,6 +34,9 @@ class SettingsMixin(OffPolicyAlgorithm):
         ``{"type": "normal", "sigma": 0.1}`` or ``{"type": "ornstein-uhlenbeck", "sigma": 0.3, "theta": 0.6, "dt": 1}``
     """
 
+    #: Whether the algorithm chooses among finitely many actions.
+    discrete: ClassVar[bool] = False
+
     def __init__(
         self,
         policy: Any,
@@ -45,7 +48,7 @@ class SettingsMixin(OffPolicyAlgorithm):
         self.actor_learning_rate = actor_learning_rate
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))
-            check_action_space(type(self).__name__, env.action_space)
+            check_action_space(type(self).__name__, env.action_space, self.discrete)
         # SB3 writes into the dictionaries that it is given.
         for name in ("policy_kwargs", "replay_buffer_kwargs"):
             kwargs[name] = dict(kwargs.get(name) or {})
@@ -61,6 +64,11 @@ class SettingsMixin(OffPolicyAlgorithm):
         if isinstance(action_noise, Mapping):
             self.action_noise = make_action_noise(action_noise, self.action_space)
         super()._setup_model()
+        if self.discrete and self.actor_learning_rate is not None:
+            raise ValueError(
+                f"`actor_learning_rate` = {self.actor_learning_rate!r}, but {type(self).__name__} has no actor: "
+                "set `learning_rate`."
+            )
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
@@ -112,8 +120,15 @@ class SettingsMixin(OffPolicyAlgorithm):
             ) from error
 
 
-def check_action_space(algorithm: str, space: spaces.Space[Any]) -> None:
-    """Refuses, in one sentence, an action space that a continuous-control algorithm cannot use."""
+def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool) -> None:
+    """Refuses, in one sentence, an action space that the algorithm cannot use."""
+    if discrete:
+        if not isinstance(space, spaces.Discrete):
+            raise ValueError(
+                f"{algorithm} needs an `env` with a finite (Discrete) action space, but this one's is {space}: choose "
+                "an algorithm for that space."
+            )
+        return
     if not isinstance(space, spaces.Box):
         raise ValueError(
             f"{algorithm} needs an `env` with a continuous (Box) action space, but this one's is {space}: choose an "
@@ -124,6 +139,13 @@ def check_action_space(algorithm: str, space: spaces.Space[Any]) -> None:
             f"{algorithm} needs an `env` whose actions are bounded, but this one's action space is {space}: wrap it in "
             "gymnasium.wrappers.RescaleAction or set finite bounds."
         )
+
+
+def check_at_least(model: Any, **minima: int) -> None:
+    """Refuses settings of a model that are too small."""
+    for name, minimum in minima.items():
+        if getattr(model, name) < minimum:
+            raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(model, name)}.")
 
 
 def make_action_noise(description: Mapping[str, Any], action_space: spaces.Space[Any]) -> ActionNoise:

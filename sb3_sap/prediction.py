@@ -1,0 +1,74 @@
+"""The predictor as a filter at run time: what the policy alone proposes, checked before it is executed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch as th
+
+from sb3_sap.candidates import candidate_actions, choose
+from sb3_sap.predictor import candidate_logits, flush_denormals
+
+if TYPE_CHECKING:
+    from sb3_sap.exploration import ActionPermissibilityMixin
+
+
+class GuidedPolicy:
+    """Predicts as a guided model with ``guided=True``, for tools that take a model, such as ``evaluate_policy``.
+
+    :param model: any guided algorithm
+    """
+
+    def __init__(self, model: ActionPermissibilityMixin):
+        self.model = model
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray[Any, Any], Any]:
+        """The model's ``predict`` with ``guided=True``."""
+        return self.model.predict(observation, state, episode_start, deterministic, guided=True)
+
+
+@th.no_grad()
+@flush_denormals()
+def guided_prediction(
+    model: ActionPermissibilityMixin, observation: Any, actions: np.ndarray[Any, Any]
+) -> np.ndarray[Any, Any]:
+    """Replaces each action that is not permissible by the nearest permissible candidate, if there is any.
+
+    The same observation always gives the same action: the candidates are drawn with a seed of their own. α plays no
+    part, nor does ``constraint``, which needs to know the action before; E takes part once it was fitted.
+
+    :param observation: one, or a batch, as ``predict`` takes it
+    :param actions: what the policy proposes, in the environment's units
+    """
+    obs, is_batch = model.policy.obs_to_tensor(observation)
+    shape = cast(Any, model.action_space).shape
+    env = model.get_vec_normalize_env()
+    raw = observation if env is None else env.unnormalize_obs(observation)
+    if not is_batch:
+        raw = {key: value[None] for key, value in raw.items()} if isinstance(raw, dict) else np.asarray(raw)[None]
+    proposed = np.asarray(actions).reshape(-1, *shape)
+    if not model.discrete:
+        proposed = model.policy.scale_action(proposed)
+    flat = proposed.reshape(len(proposed), -1)
+    ones = np.ones_like(flat)
+    candidates = candidate_actions(np.random.default_rng(0), model.action_space, -ones, ones, model.n_candidates)
+    # The proposal itself comes first and is its own nearest candidate.
+    candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
+    permissible = model._allowed_candidates(raw, candidates)
+    if model.predictor.fitted:
+        permissible &= candidate_logits(model.predictor, model.predictor.features(obs), candidates) > 0
+    found = permissible.any(axis=1)
+    if not found.any():
+        return actions
+    distance = np.linalg.norm(candidates - flat[:, None], axis=2)
+    flat = flat.copy()
+    flat[found] = choose(model._rng, candidates[found], permissible[found], -distance[found])
+    changed = (flat != proposed.reshape(flat.shape)).any(axis=1)
+    if not changed.any():
+        return actions
+    guided = np.array(actions).reshape(proposed.shape)
+    guided[changed] = model._unscale(flat.reshape(proposed.shape))[changed]
+    return guided.reshape(np.shape(actions))

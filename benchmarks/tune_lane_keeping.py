@@ -26,7 +26,7 @@ from sb3_sap.evaluation import drive_lap
 BASES = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC, "crossq": CrossQ}
 VALIDATION_TRACKS = ("g-track-1", "aalborg", "e-track-1")
 CHECKPOINTS = (250, 500, 750, 1_000)
-NETS = {"64-64": [64, 64], "128-256": [128, 256], "256-256": [256, 256], "400-300": [400, 300]}
+NETS = {"64-64": [64, 64], "128-256": [128, 256], "256-256": [256, 256], "400-300": [400, 300], "1024-1024": [1024, 1024]}
 GOOD_GUESS = {"gamma": 0.9, "learning_rate": 1e-3, "net": "128-256"}
 
 
@@ -41,7 +41,9 @@ def space(algo: str) -> dict[str, list]:
         "batch_size": [256, 128, 64],
         "learning_starts": [100, 50],
     }
-    if algo != "crossq":
+    if algo == "crossq":
+        settings["critic_net"] = ["1024-1024", "256-256"]
+    else:
         settings["tau"] = [0.005, 0.01, 0.02]
     if algo in ("ddpg", "td3"):
         settings["noise"] = [0.0, 0.1, 0.3]
@@ -49,8 +51,10 @@ def space(algo: str) -> dict[str, list]:
 
 
 def constructor_arguments(chosen: dict) -> dict:
-    arguments = {k: v for k, v in chosen.items() if k not in ("net", "noise")}
-    arguments["policy_kwargs"] = {"net_arch": NETS[chosen["net"]]}
+    arguments = {k: v for k, v in chosen.items() if k not in ("net", "critic_net", "noise")}
+    actor = NETS[chosen["net"]]
+    critic = NETS[chosen["critic_net"]] if "critic_net" in chosen else actor
+    arguments["policy_kwargs"] = {"net_arch": {"pi": actor, "qf": critic}}
     if chosen.get("noise"):
         arguments["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, chosen["noise"]))
     return arguments
@@ -60,8 +64,6 @@ def run(algo: str, chosen: dict, seed: int) -> list[float]:
     """Mean S over the validation tracks at every checkpoint."""
     env = gym.make("sap/TorcsLaneKeeping-v0", track="wheel-2", laps=None)
     arguments = constructor_arguments(chosen)
-    if algo == "crossq":  # its critic is another, wider net; only the actor's is chosen here
-        arguments["policy_kwargs"] = {"net_arch": {"pi": NETS[chosen["net"]], "qf": [1024, 1024]}}
     model = BASES[algo]("MlpPolicy", env, seed=seed, device="cpu", **arguments)
     scores = []
     for checkpoint in CHECKPOINTS:
@@ -83,7 +85,7 @@ def main() -> None:
     default = {name: values[0] for name, values in choices.items()}
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=100, n_startup_trials=6))
     study.enqueue_trial(default)
-    study.enqueue_trial(default | GOOD_GUESS)
+    study.enqueue_trial(default | GOOD_GUESS | ({"critic_net": "256-256"} if options.algo == "crossq" else {}))
     with open(options.out / f"{options.algo}.csv", "w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["algo", "kind", "seed", *(f"s_{c}" for c in CHECKPOINTS), "mean", *choices])

@@ -24,7 +24,7 @@ def candidate_actions(
     :return: (m, n, action_dim)
     """
     if isinstance(space, spaces.Discrete):
-        return np.broadcast_to(np.arange(space.n)[:, None], (len(low), int(space.n), 1))
+        return np.tile(np.arange(space.n)[:, None], (len(low), 1, 1))
     return stratified_candidates(rng, low, high, n)
 
 

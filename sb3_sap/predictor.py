@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, create_mlp
 from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
@@ -91,7 +91,7 @@ class PermissibilityPredictor(BaseModel):
         )
         self.batch_size = batch_size
         self.features_extractor = self.make_features_extractor()
-        n_inputs = self.features_extractor.features_dim + get_action_dim(action_space)
+        n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
         self.head = nn.Sequential(*create_mlp(n_inputs, 1, list(net_arch), activation_fn))
         # Buffers are saved with the weights: a loaded E knows whether it was ever fitted.
         self.register_buffer("n_updates", th.zeros((), dtype=th.long))
@@ -166,6 +166,6 @@ def candidate_logits(
 ) -> FloatArray:
     """E's (m, n) logits of (m, n, action_dim) candidates in m states of (m, features_dim) features, in one call."""
     m, n, dim = candidates.shape
-    actions = th.as_tensor(np.ascontiguousarray(candidates).reshape(m * n, dim), device=features.device)
+    actions = th.as_tensor(candidates.reshape(m * n, dim), device=features.device)
     logits = predictor.logits(features.repeat_interleave(n, dim=0), actions)
     return logits.cpu().numpy().reshape(m, n)

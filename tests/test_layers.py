@@ -18,7 +18,17 @@ FLOORS = (
     {"algorithms"},
     {"exploration"},
     {"learning"},
-    {"constraints", "callbacks", "buffers", "knowledge", "predictor", "settings", "actor_loss", "candidates", "prediction"},
+    {
+        "constraints",
+        "callbacks",
+        "buffers",
+        "knowledge",
+        "predictor",
+        "settings",
+        "actor_loss",
+        "candidates",
+        "prediction",
+    },
     {"permissibility", "generators", "files"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import set_random_seed
-from toy import ALGORITHMS, CONSTRAINED, GUIDED, Line, build, nearby, towards_centre
+from toy import ALGORITHMS, CONSTRAINED, DISCRETE, GUIDED, Line, build, nearby, towards_centre
 
 from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, PermissibilityNStepReplayBuffer
 
@@ -39,7 +39,7 @@ def state(model):
     found["R"] = [getattr(model.replay_buffer, name) for name in names]
     if hasattr(model, "_rng"):
         found["rng"] = model._rng.bit_generator.state
-    if type(model) in GUIDED:
+    if type(model) in GUIDED + DISCRETE:
         found |= {"K": knowledge_state(model), "accuracy": model.validation_accuracy, "alpha": model.current_alpha}
         found |= {"fitted": model.predictor.fitted, "earlier": model._steps_of_earlier_learns}
     return flat(found)

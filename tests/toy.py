@@ -8,9 +8,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2, SACAP, TD3AP, TQCAP, CrossQAP
+from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, DDPGCE1, DDPGCE2, DQNAP, QRDQNAP, SACAP, TD3AP, TQCAP, CrossQAP
 
 GUIDED = (DDPGAP, DDPGAPCE2, TD3AP, SACAP, TQCAP, CrossQAP)
+DISCRETE = (DQNAP, QRDQNAP)
 CONSTRAINED = (DDPGCE1, DDPGCE2, DDPGAPCE2)
 ALGORITHMS = (DDPG, DDPGCE1, DDPGCE2, *GUIDED)
 
@@ -23,6 +24,7 @@ class Line(gym.Env[Any, Any]):
     :param high: upper bound of each
     :param labels: whether ``info["permissible"]`` is there
     :param reuse: whether every observation is the same array, written over
+    :param n_actions: so many actions, evenly from left to right, instead of continuous ones
     """
 
     def __init__(
@@ -35,9 +37,11 @@ class Line(gym.Env[Any, Any]):
         reuse: bool = False,
         horizon: int = 10,
         action_dtype: Any = np.float32,
+        n_actions: int | None = None,
     ):
         self.kind, self.labels, self.reuse, self.horizon = kind, labels, reuse, horizon
-        self.action_space = spaces.Box(low, high, (dim,), action_dtype)
+        box = spaces.Box(low, high, (dim,), action_dtype)
+        self.action_space: Any = box if n_actions is None else spaces.Discrete(n_actions)
         plain = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         number = spaces.Box(-np.inf, np.inf, (1,), np.float32)
         self.observation_space = {
@@ -69,7 +73,10 @@ class Line(gym.Env[Any, Any]):
         self.executed.append(np.copy(action))
         space = self.action_space
         before = self.x
-        self.x += 0.1 * float(np.mean(2 * (action - space.low) / (space.high - space.low) - 1))
+        if isinstance(space, spaces.Discrete):
+            self.x += 0.1 * float(2 * action / (space.n - 1) - 1)
+        else:
+            self.x += 0.1 * float(np.mean(2 * (action - space.low) / (space.high - space.low) - 1))
         self.steps += 1
         info = {"permissible": bool(abs(self.x) <= abs(before))} if self.labels else {}
         return self._observe(), -abs(self.x), False, self.steps >= self.horizon, info
@@ -102,7 +109,7 @@ def build(algorithm: Any, env: Any = None, **overrides: Any) -> Any:
         "seed": 1,
         "device": "cpu",
     }
-    if algorithm in GUIDED:
+    if algorithm in GUIDED + DISCRETE:
         settings |= {
             "dataset_size": 16,
             "validation_size": 8,
@@ -112,4 +119,6 @@ def build(algorithm: Any, env: Any = None, **overrides: Any) -> Any:
     if algorithm in CONSTRAINED:
         settings |= {"constraint": nearby}
     policy = overrides.pop("policy", "MlpPolicy")
-    return algorithm(policy, Line() if env is None else env, **(settings | overrides))
+    if env is None:
+        env = Line(n_actions=3) if algorithm in DISCRETE else Line()
+    return algorithm(policy, env, **(settings | overrides))

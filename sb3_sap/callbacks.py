@@ -19,7 +19,7 @@ CONSTANT_LABELS_WARNING = 1_000
 
 
 class PermissibilityCallback(BaseCallback):
-    """Fits E once for every vectorised environment step, at the end of each rollout, then validates it.
+    """Fits E, at the end of each rollout, once for every ``permissibility_freq`` vectorised steps, then validates it.
 
     A guided model installs one by itself. To change how E is trained, override :meth:`fit` or :meth:`validate` and
     pass an instance to ``learn(callback=...)``: it takes the place of the default.
@@ -50,13 +50,21 @@ class PermissibilityCallback(BaseCallback):
         knowledge = self.knowledge
         new = np.subtract(knowledge.seen, self._seen)
         self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
+        due = self._fits_due()
         if min(knowledge.counts("train")) >= self.model.min_per_class:
-            for _ in range((self.model.num_timesteps - self._start) // self.model.n_envs):
+            for _ in range(due):
                 self.fit()
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)
-        if self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
+        if due > 0 and self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
             self.validate()
+
+    def _fits_due(self) -> int:
+        model = self.model
+        before, now = (
+            steps // model.n_envs // model.permissibility_freq for steps in (self._start, model.num_timesteps)
+        )
+        return now - before
 
     def fit(self) -> None:
         """One pass over a balanced D_E of ``dataset_size`` examples."""

@@ -110,11 +110,12 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         return self.alpha if self.predictor_suffices else min(self.alpha_low, self.alpha)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        before = self._n_updates
         super().train(gradient_steps, batch_size)
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
         if coef == 0 or not self.predictor_suffices:
             return
-        for _ in range(gradient_steps):
+        for _ in range(self._n_updates // self.permissibility_freq - before // self.permissibility_freq):
             loss = permissible_actor_step(
                 self.actor,
                 self.predictor,

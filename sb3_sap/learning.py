@@ -37,6 +37,8 @@ class LearnedPermissibilityMixin(SettingsMixin):
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
     :param min_per_class: examples of each class that K must hold before E is fitted
+    :param permissibility_freq: once in so many steps E is fitted and validated, and teaches the actor where it does;
+        1 is the paper's
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
     """
 
@@ -49,6 +51,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
         dataset_size: int = 512,
         validation_size: int = 200,
         min_per_class: int = 20,
+        permissibility_freq: int = 1,
         predictor_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -58,13 +61,14 @@ class LearnedPermissibilityMixin(SettingsMixin):
         self.dataset_size = dataset_size
         self.validation_size = validation_size
         self.min_per_class = min_per_class
+        self.permissibility_freq = permissibility_freq
         self.predictor_kwargs = predictor_kwargs
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        check_at_least(self, min_per_class=1, dataset_size=2, validation_size=2)
+        check_at_least(self, min_per_class=1, dataset_size=2, validation_size=2, permissibility_freq=1)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.

@@ -101,3 +101,16 @@ def test_it_waits_until_e_is_good_enough(monkeypatch):
     model.validation_accuracy = 0.7
     model.train(3, 8)
     assert len(calls) == 3
+
+
+def test_it_acts_once_in_so_many_updates(monkeypatch):
+    calls = []
+    monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
+    model = build(DDPGAP, actor_permissibility_coef=1.0, permissibility_freq=3).learn(60)
+    model.validation_accuracy, model._n_updates = 1.0, 2
+    calls.clear()
+    numbers = []
+    for updates in (1, 1, 1, 4):  # to 3, 4, 5 and 9: at 3, and at 6 and 9
+        model.train(updates, 8)
+        numbers.append(len(calls))
+    assert numbers == [1, 1, 1, 3]

@@ -102,6 +102,7 @@ def test_a_wrapper_that_labels_with_numbers():
         ({"alpha": "much"}, "^`alpha` is a probability from 0 to 1, but is 'much'"),
         ({"t_k": -1}, "^`t_k` is a number of steps, 0 or more, but is -1"),
         ({"n_candidates": 0}, "^`n_candidates` must be at least 1, but is 0"),
+        ({"permissibility_freq": 0}, "^`permissibility_freq` must be at least 1, but is 0"),
         ({"min_per_class": 0}, "^`min_per_class` must be at least 1, but is 0"),
         ({"dataset_size": 1}, "^`dataset_size` must be at least 2, but is 1"),
         ({"validation_size": 0}, "^`validation_size` must be at least 2, but is 0"),

@@ -40,6 +40,9 @@ class NoCallback(BaseCallback):
         ({"train_freq": (1, "episode")}, 1, [5] * 5 + [10] * 5 + [15] * 5),
         # One fit for each vectorised step, after which two transitions are new.
         ({"train_freq": 2}, 2, [8] * 2 + [12] * 2),
+        ({"train_freq": 1, "permissibility_freq": 3}, 1, [9, 12]),
+        # The multiples of 3 are 9 and 12; a rollout ends after 8, 10 and 12.
+        ({"train_freq": 2, "permissibility_freq": 3}, 1, [10, 12]),
     ],
 )
 def test_fits_follow_the_steps_collected(settings, n_envs, expected):

@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from sb3_sap import DDPGAP
-from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS
-from sb3_sap.demo import TrainingLog, paper_score, results_table
+from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
+from sb3_sap.demo import TrainingLog, results_table
 from sb3_sap.envs import get_track
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
 from sb3_sap.evaluation import LapResult, drive_lap, load_policy, write_results

@@ -1,6 +1,8 @@
 """Columns and cells: what is compared, and what is run for it."""
 
 import json
+import os
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +15,7 @@ from sb3_sap.benchmark.learners import CLASSES, make_model, settings_of
 from sb3_sap.benchmark.linear import GAINS, LinearFeedback
 from sb3_sap.benchmark.training import Recorder, run_cell
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
+from sb3_sap.envs.torcs.installation import TorcsNotFoundError, find_installation
 
 
 def cell(text, steps=100, seed=0, tracks=("g-track-3",), simulator="highway"):
@@ -200,6 +203,25 @@ def test_evaluation_does_not_change_training(algo):
     watched = train(Recorder([40, 60, 80], evaluate, Clock())).policy.state_dict()
     assert evaluated == [40, 60, 80]
     assert all(th.equal(alone[name], watched[name]) for name in alone)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("algo", "simulator"), [("ddpg_ap", "torcs"), ("sbx_sac", "highway"), ("tqc", "highway")])
+def test_a_run_is_the_same_however_often_it_is_evaluated(algo, simulator):
+    if simulator == "torcs" and not os.environ.get("SB3_SAP_REQUIRE_TORCS"):
+        try:
+            find_installation()
+        except TorcsNotFoundError as error:
+            pytest.skip(str(error))
+    if algo.startswith("sbx"):
+        pytest.importorskip("sbx")
+    often = cell(f"{algo}[learning_starts=30]", steps=150, simulator=simulator)
+    often = replace(often, checkpoints=[30, 60, 90, 150])
+    seldom = replace(often, checkpoints=[150])
+    first, second = run_cell(often, 0.0), run_cell(seldom, 0.0)
+    assert first["curve"] == second["curve"]
+    assert first["episodes"] == second["episodes"]
+    assert first["laps"]["data"][3:] == second["laps"]["data"]
 
 
 def test_every_class_exists():

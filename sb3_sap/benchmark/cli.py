@@ -106,7 +106,7 @@ def _report_all(options: argparse.Namespace, console: Console) -> int:
             _write(options, name, console, known_alone=True)
             written += 1
         except NoResults as error:
-            console.print(f"{name} is left out: {error}", soft_wrap=True)
+            console.print(f"{name} is left out: {error}", soft_wrap=True, markup=False)
     options.columns = ["paper"]
     if written:
         _write_claims(options, console)

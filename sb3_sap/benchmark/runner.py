@@ -40,7 +40,8 @@ def run_grid(
     """
     missing = missing_cells(grid, folder)
     total = len({cell.path(folder) for cells in grid.values() for cell in cells})
-    console.print(f"{total} cells, {total - len(missing)} of them done already; results in [bold]{folder}/[/]")
+    done = f"{total} cells, {total - len(missing)} of them done already; results in {folder}/"
+    console.print(done, markup=False, soft_wrap=True)
     failed = 0
     with _progress(console) as progress, _workers(backend, scheduler):
         task = progress.add_task("cells", total=len(missing))

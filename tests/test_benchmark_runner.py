@@ -105,6 +105,13 @@ def test_errors_are_one_sentence(arguments, message, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
+def test_a_missing_library_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.delitem(sys.modules, "sb3_sap.benchmark.runner")
+    monkeypatch.setitem(sys.modules, "joblib", None)
+    assert main(["benchmark", "run", "--out", str(tmp_path)]) == 1
+    assert "needs joblib: pip install 'sb3-sap[benchmark]'" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_process_that_fails_or_dies_says_so():
     [[unknown], [killed]] = grid("ddpg[env.trak=1]", "ddpg", seeds=1, steps=100_000).values()

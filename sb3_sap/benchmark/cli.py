@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from sb3_sap.benchmark.cells import Cell
     from sb3_sap.benchmark.columns import Column
 
+Command = Callable[[argparse.Namespace, Console], int]
 #: Each report, the columns that it shows unless told otherwise, and what it is.
 REPORTS = {
     "table2": (["paper"], "Table 2, the paper's figures beside ours"),
@@ -37,20 +39,20 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     _add_columns(command, ["paper"])
     _add_grid(command)
     _add_workers(command)
-    command.set_defaults(run=_run)
+    command.set_defaults(run=_with_extra(_run))
     for name, (columns, text) in REPORTS.items():
         command = actions.add_parser(name, help=f"{text}; runs what is missing", description=f"{text}.")
         _add_columns(command, columns)
         _add_grid(command)
         _add_workers(command)
-        command.set_defaults(run=_report, report=name)
+        command.set_defaults(run=_with_extra(_report), report=name)
     command = actions.add_parser("claims", help="each result that section 5.2 states, ours, and a verdict; 3k and 15k")
     _add_grid(command, steps=False)
     _add_workers(command)
-    command.set_defaults(run=_claims, columns=["paper"], tracks=list(TEST_TRACKS))
+    command.set_defaults(run=_with_extra(_claims), columns=["paper"], tracks=list(TEST_TRACKS))
     command = actions.add_parser("report", help="write all of these from the runs that there are; runs nothing")
     _add_grid(command)
-    command.set_defaults(run=_report_all)
+    command.set_defaults(run=_with_extra(_report_all))
 
 
 def _add_columns(command: argparse.ArgumentParser, columns: list[str]) -> None:
@@ -78,6 +80,18 @@ def _add_workers(command: argparse.ArgumentParser) -> None:
     command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="runs side by side on this machine")
     command.add_argument("--backend", choices=["local", "dask"], default="local", help="dask: on a cluster")
     command.add_argument("--scheduler", metavar="ADDRESS", help="of the Dask cluster")
+
+
+def _with_extra(run: Command) -> Command:
+    """The same, which says so when a library of the extra is missing."""
+
+    def checked(options: argparse.Namespace, console: Console) -> int:
+        try:
+            return run(options, console)
+        except ModuleNotFoundError as error:
+            raise ValueError(f"sb3-sap benchmark needs {error.name}: pip install 'sb3-sap[benchmark]'.") from error
+
+    return checked
 
 
 def _run(options: argparse.Namespace, console: Console) -> int:

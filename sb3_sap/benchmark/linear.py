@@ -8,10 +8,10 @@ import numpy as np
 
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
 
-#: steering = angle · angle/lock + track_pos · trackPos + speed_y · speedY/50, for each simulator.
+#: The search is benchmarks/linear_gains.py; steering = angle · angle/lock + track_pos · trackPos + speed_y · speedY/50, for each simulator.
 GAINS = {
     "torcs": {"angle": 2.5, "track_pos": -1.6, "speed_y": 1.0},
-    "highway": {"angle": 4.0, "track_pos": -10.0, "speed_y": -6.0},
+    "highway": {"angle": 4.0, "track_pos": -16.0, "speed_y": -8.0},
 }
 
 

@@ -12,7 +12,7 @@ import torch as th
 from sb3_sap.benchmark.cells import make_cell, make_grid, read_result, write_result
 from sb3_sap.benchmark.columns import GROUPS, Column, parse_column, parse_columns
 from sb3_sap.benchmark.learners import CLASSES, make_model, settings_of
-from sb3_sap.benchmark.linear import GAINS, LinearFeedback
+from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.training import Recorder, run_cell
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
 from sb3_sap.envs.torcs.installation import TorcsNotFoundError, find_installation
@@ -142,7 +142,7 @@ def test_seeds_of_a_column_share_the_name_of_their_files(tmp_path):
 
 
 def test_linear_feedback():
-    policy = LinearFeedback(**GAINS["torcs"])
+    policy = LinearFeedback(angle=2.5, track_pos=-1.6, speed_y=1.0)
     obs = np.array([[STEERING_LOCK / 10, 0, 0, 0, 0], [0, 0.5, 1, 0, 0], [0, -1, 1, 1, 0]], dtype=np.float32)
     assert policy.predict(obs)[0] == pytest.approx(np.array([[0.25], [-0.8], [1.0]]))
     assert policy.predict(obs[1])[0].shape == (1,)

@@ -8,10 +8,11 @@ import numpy as np
 
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
 
-#: The search is benchmarks/linear_gains.py; steering = angle · angle/lock + track_pos · trackPos + speed_y · speedY/50, for each simulator.
+#: steering = angle · angle/lock + track_pos · trackPos + speed_y · speedY/50, for each simulator. What
+#: `benchmarks/linear_gains.py` found.
 GAINS = {
-    "torcs": {"angle": 2.5, "track_pos": -1.6, "speed_y": 1.0},
-    "highway": {"angle": 4.0, "track_pos": -16.0, "speed_y": -8.0},
+    "torcs": {"angle": 2.2, "track_pos": -4.8, "speed_y": 0.8},
+    "highway": {"angle": 5.2, "track_pos": -19.3, "speed_y": -12.8},
 }
 
 

@@ -16,9 +16,9 @@ import numpy as np
 import pandas as pd
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from tables import markdown
 
 from sb3_sap import DDPGAP
+from sb3_sap.benchmark.pages import markdown
 from sb3_sap.files import atomic_path
 
 STEPS, FROM = 2_000, 500

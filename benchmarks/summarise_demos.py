@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from tables import markdown
 
+from sb3_sap.benchmark.pages import markdown
 from sb3_sap.files import atomic_path
 from sb3_sap.statistics import bootstrap_interval, interquartile_mean
 

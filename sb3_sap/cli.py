@@ -10,6 +10,7 @@ import torch as th
 from rich.console import Console
 
 from sb3_sap import __version__
+from sb3_sap.benchmark.cli import add_benchmark
 from sb3_sap.envs.torcs.cli import add_torcs
 from sb3_sap.evaluation import ENVIRONMENTS
 
@@ -37,6 +38,7 @@ def parser() -> argparse.ArgumentParser:
     commands = root.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_demo(commands)
     _add_evaluate(commands)
+    add_benchmark(commands)
     add_torcs(commands)
     return root
 

@@ -19,8 +19,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap import algorithms, plots
-from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS
-from sb3_sap.envs import TRACKS, score
+from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
+from sb3_sap.envs import TRACKS
 from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive, drive_lap, write_results
 from sb3_sap.files import atomic_path
 from sb3_sap.presets import preset
@@ -158,13 +158,6 @@ def results_table(results: list[LapResult], algo: str | None = None, steps: int 
             row += [f"{lap.covered:.1%}", f"{paper_score(result.track, lap.total_reward):.3f}"]
         table.add_row(*row)
     return table
-
-
-def paper_score(track: str, total_reward: float) -> float:
-    """S of a total of Table 2, at the control step of 0.2 s that the totals imply."""
-    from sb3_sap.envs import get_track
-
-    return score(total_reward, get_track(track).length, 0.2)
 
 
 def draw(run: Run, model: Any, training: pd.DataFrame) -> None:

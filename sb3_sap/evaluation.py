@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
-from rich.progress import Progress
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_sap.envs import score
 from sb3_sap.files import atomic_path
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 #: The lane-keeping task on each simulator.
 ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0", "torcs": "sap/TorcsLaneKeeping-v0"}
@@ -48,21 +50,43 @@ def drive(policy: Any, env: gym.Env[Any, Any]) -> Iterator[tuple[float, dict[str
         yield float(reward), info
 
 
-def drive_lap(policy: Any, track: str, simulator: str = "highway", progress: Progress | None = None) -> LapResult:
-    """Drives one lap of a track."""
-    env = gym.make(ENVIRONMENTS[simulator], track=track, laps=1)
-    task = progress.add_task(f"lap of {track}", total=1.0) if progress else None
+def lap_env(track: str, simulator: str = "highway", **options: Any) -> gym.Env[Any, Any]:
+    """Makes the environment of one lap; it may be driven any number of times."""
+    return gym.make(ENVIRONMENTS[simulator], track=track, laps=1, **options)
+
+
+def lap(
+    policy: Any, env: gym.Env[Any, Any], track: str, on_step: Callable[[dict[str, Any]], object] | None = None
+) -> LapResult:
+    """Drives one lap in an environment of :func:`lap_env`.
+
+    Several tracks are driven one after the other on purpose. Asking the policy for all of them at once would save a
+    tenth of the time, most of which is physics, and would change the last bit of its actions.
+
+    :param on_step: called with the info of each step
+    """
     rewards = []
     info: dict[str, Any] = {}
     for reward, info in drive(policy, env):
         rewards.append(reward)
-        if progress and task is not None:
-            progress.update(task, completed=info["covered"])
+        if on_step:
+            on_step(info)
     driven = env.unwrapped.simulator  # type: ignore[attr-defined]
-    env.close()
     total = sum(rewards)
     normalised = score(total, driven.length, driven.control_step)
     return LapResult(track, bool(info["lap_done"]), float(info["covered"]), total, normalised, len(rewards))
+
+
+def drive_lap(policy: Any, track: str, simulator: str = "highway", progress: Progress | None = None) -> LapResult:
+    """Drives one lap of a track."""
+    env = lap_env(track, simulator)
+    try:
+        if progress is None:
+            return lap(policy, env, track)
+        task = progress.add_task(f"lap of {track}", total=1.0)
+        return lap(policy, env, track, lambda info: progress.update(task, completed=info["covered"]))
+    finally:
+        env.close()
 
 
 def write_results(path: Path, results: list[LapResult]) -> None:

@@ -30,3 +30,29 @@ def bootstrap_interval(
     tail = (1 - confidence) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
     return float(low), float(high)
+
+
+def probability_of_improvement(
+    ours: FloatArray, theirs: FloatArray, confidence: float = 0.95, resamples: int = 2_000, seed: int = 0
+) -> tuple[float, float, float]:
+    """How probably a run of ours beats one of theirs on a task drawn at random, ties counting half; with its interval.
+
+    :param ours: (runs, tasks)
+    :param theirs: (runs, tasks), of the same tasks
+    """
+    rng = np.random.default_rng(seed)
+
+    def resampled(scores: FloatArray) -> FloatArray:
+        n_runs, n_tasks = scores.shape
+        chosen: FloatArray = scores[rng.integers(n_runs, size=(resamples, n_runs, n_tasks)), np.arange(n_tasks)]
+        return chosen
+
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(_share_of_wins(resampled(ours), resampled(theirs)), [tail, 1 - tail])
+    return float(_share_of_wins(ours, theirs)), float(low), float(high)
+
+
+def _share_of_wins(ours: FloatArray, theirs: FloatArray) -> Any:
+    """Over all pairs of runs and all tasks; (…, runs, tasks) each."""
+    difference = ours[..., :, None, :] - theirs[..., None, :, :]  # (…, our runs, their runs, tasks)
+    return ((np.sign(difference) + 1) / 2).mean(axis=(-3, -2, -1))

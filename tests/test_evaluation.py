@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from sb3_sap import DDPGAP
-from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS
-from sb3_sap.demo import TrainingLog, paper_score, results_table
+from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
+from sb3_sap.demo import TrainingLog, results_table
 from sb3_sap.envs import get_track
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
-from sb3_sap.evaluation import LapResult, drive_lap, load_policy, write_results
+from sb3_sap.evaluation import LapResult, drive_lap, lap, lap_env, load_policy, write_results
 
 
 class Feedback:
@@ -102,3 +102,10 @@ def test_training_log_has_a_row_for_every_step():
     assert list(table["step"]) == list(range(1, 61))
     assert (table.loc[table["off_track"], "reward"] == -200).all()
     assert table["off_track"].any()
+
+
+def test_a_road_may_be_driven_again():
+    env = lap_env("g-track-3")
+    first = [lap(Feedback(lost), env, "g-track-3") for lost in (False, True, False)]
+    assert first[0] == first[2] == drive_lap(Feedback(), "g-track-3")
+    assert first[1] == drive_lap(Feedback(lost=True), "g-track-3")

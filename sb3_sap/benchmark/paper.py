@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from sb3_sap.envs import get_track, score
+
 #: Test tracks in the table's order, by TORCS' directory names.
 TEST_TRACKS = ("eroad", "spring", "g-track-3", "ole-road-1")
 
@@ -36,3 +38,11 @@ TABLE_2: dict[int, dict[str, dict[str, PaperLap]]] = {
         "ddpg_ap_ce2": _cells((1, 54848.50), (1, 374224.10), (1, 48101.77), (1, 107351.01)),
     },
 }
+
+#: s between two actions of the paper's agents, as the totals of Table 2 imply it.
+CONTROL_STEP = 0.2
+
+
+def paper_score(track: str, total_reward: float) -> float:
+    """S of a total of Table 2."""
+    return score(total_reward, get_track(track).length, CONTROL_STEP)

@@ -1,0 +1,115 @@
+"""From a column to a model: which class an algorithm is, and which settings it gets."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_sap.benchmark.columns import Column, unknown_algorithm
+from sb3_sap.benchmark.linear import GAINS
+from sb3_sap.presets import preset
+from sb3_sap.settings import SettingsMixin, make_action_noise
+
+#: The class of each algorithm, imported only when it is needed.
+CLASSES = {
+    "ddpg": "sb3_sap:DDPG",  # SB3's to the bit, unless the actor has a learning rate of its own
+    "td3": "stable_baselines3:TD3",
+    "sac": "stable_baselines3:SAC",
+    "tqc": "sb3_contrib:TQC",
+    "crossq": "sb3_contrib:CrossQ",
+    "ddpg_ce1": "sb3_sap:DDPGCE1",
+    "ddpg_ce2": "sb3_sap:DDPGCE2",
+    "ddpg_ap": "sb3_sap:DDPGAP",
+    "ddpg_ap_ce2": "sb3_sap:DDPGAPCE2",
+    "td3_ap": "sb3_sap:TD3AP",
+    "sac_ap": "sb3_sap:SACAP",
+    "tqc_ap": "sb3_sap:TQCAP",
+    "crossq_ap": "sb3_sap:CrossQAP",
+    "sbx_ddpg": "sbx:DDPG",
+    "sbx_td3": "sbx:TD3",
+    "sbx_sac": "sbx:SAC",
+    "sbx_tqc": "sbx:TQC",
+    "sbx_crossq": "sbx:CrossQ",
+}
+#: An override of this kind is an option of the environment, not of the algorithm.
+ENVIRONMENT = "env."
+
+
+def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
+    """The class of an algorithm."""
+    if algo not in CLASSES:
+        raise unknown_algorithm(algo, [*CLASSES, "linear"])
+    module, _, name = CLASSES[algo].partition(":")
+    try:
+        found: type[OffPolicyAlgorithm] = getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        if module != "sbx":
+            raise
+        raise ValueError(f"{algo} needs SBX, and {error.name} is missing: pip install 'sb3-sap[peers]'.") from error
+    return found
+
+
+def settings_of(column: Column, simulator: str, steps: int) -> dict[str, Any]:
+    """Constructor arguments: the preset's, with the column's overrides."""
+    if column.algo == "linear":
+        base: dict[str, Any] = dict(GAINS[simulator])
+        known = set(base)
+    else:
+        known = set(inspect.signature(algorithm_class(column.algo)).parameters)
+        base = preset(column.preset, column.algo.removeprefix("sbx_"), steps)
+        if column.algo.startswith("sbx_"):
+            base = _for_sbx(base)
+    settings = copy.deepcopy(base)
+    for key, value in column.changes.items():
+        if not key.startswith(ENVIRONMENT):
+            _set(settings, key.split("."), value)
+    for name in settings.keys() - known:
+        raise ValueError(f"{column.name}: {column.algo} has no setting {name!r}.")
+    return settings
+
+
+def defaults_of(column: Column, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The constructor's own values of what the settings leave open: when a library changes them, results are others."""
+    if column.algo == "linear":
+        return {}
+    parameters = inspect.signature(algorithm_class(column.algo)).parameters.values()
+    plain = (bool, int, float, str, tuple, type(None))
+    return {p.name: p.default for p in parameters if p.name not in settings and isinstance(p.default, plain)}
+
+
+def environment_of(column: Column) -> dict[str, Any]:
+    """Options of the training environment."""
+    return {key.removeprefix(ENVIRONMENT): v for key, v in column.changes.items() if key.startswith(ENVIRONMENT)}
+
+
+def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> OffPolicyAlgorithm:
+    """A fresh model on the processor, where networks this small are fastest."""
+    cls = algorithm_class(algo)
+    arguments = copy.deepcopy(dict(settings))
+    if isinstance(arguments.get("action_noise"), Mapping) and not issubclass(cls, SettingsMixin):
+        arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
+    return cls("MlpPolicy", env, seed=seed, device="cpu", **arguments)
+
+
+def _for_sbx(settings: dict[str, Any]) -> dict[str, Any]:
+    """The same settings as SBX names them: its critics have a rate of their own, in DDPG and TD3 by default."""
+    settings = dict(settings)
+    if "learning_rate" in settings:
+        settings["qf_learning_rate"] = settings["learning_rate"]
+    if "actor_learning_rate" in settings:
+        settings["learning_rate"] = settings.pop("actor_learning_rate")
+    return settings
+
+
+def _set(settings: dict[str, Any], path: list[str], value: Any) -> None:
+    *folders, name = path
+    for folder in folders:
+        settings = settings.setdefault(folder, {})
+        if not isinstance(settings, dict):
+            raise ValueError(f"{'.'.join(path)} cannot be set: {folder!r} is not a mapping.")
+    settings[name] = value

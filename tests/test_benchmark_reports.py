@@ -1,0 +1,228 @@
+"""Tables, figures and claims from synthetic cells, whose figures can be computed in the head."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from sb3_sap.benchmark.cells import make_grid, write_result
+from sb3_sap.benchmark.claims import CLAIMS, claims, judged
+from sb3_sap.benchmark.columns import parse_columns
+from sb3_sap.benchmark.figures import with_averages
+from sb3_sap.benchmark.measures import median_reached, per_run, steps_to_competence, wall_to_competence
+from sb3_sap.benchmark.paper import TEST_TRACKS
+from sb3_sap.benchmark.results import collect
+from sb3_sap.benchmark.tables import improvement
+from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, LAP_COLUMNS, TIME_COLUMNS
+from sb3_sap.cli import main
+from sb3_sap.statistics import probability_of_improvement
+
+MADE = {"versions": {"python": "3.11"}, "machine": "a machine", "date": "2020-01-02", "revision": "abc"}
+#: S after 250 steps, 500 and the rest, by algorithm; what is below 0.5 is a lap that was not done.
+SCORES = {"ddpg": (0.1, 0.2), "ddpg_ap": (0.91, 0.96), "ddpg_ap_ce2": (0.2, 0.93), "ddpg_ce1": (0.5, 0.5)}
+
+
+def synthetic(cell, accuracy=0.8):
+    """The result of a cell: S by algorithm and checkpoint, plus 0.002 for each seed; ten steps an episode."""
+    early, late = SCORES.get(cell.algo, (0.9, 0.9))
+    laps, times = [], []
+    for point in cell.checkpoints:
+        score = (early if point == 250 else late) + cell.seed / 500
+        laps += [[point, track, score > 0.4, min(score * 2, 1), 1000 * score, score, 10] for track in cell.tracks]
+        times.append([point, 4 + point / 100, point / 100, point / 100])
+    guided = "_ap" in cell.algo
+    steps = range(25, cell.steps + 1, 25)
+    low = 300 if guided else cell.steps  # the step until which the moving average is low
+    e = (accuracy, accuracy - 0.05) if guided else (None, None)
+    curve = [[step, 10.0 if step <= low else 45.0, *e] for step in steps]
+    lost = 10 if guided else 130
+    episodes = [[10 * (i + 1), 10, -200.0, "off track"] for i in range(lost)]
+    episodes.append([cell.steps, cell.steps - 10 * lost, 40.0 * (cell.steps - 10 * lost), "unfinished"])
+    if cell.algo == "linear":
+        times, curve, episodes = [], [], []
+    tables = {"laps": (LAP_COLUMNS, laps), "times": (TIME_COLUMNS, times), "curve": (CURVE_COLUMNS, curve)}
+    tables["episodes"] = (EPISODE_COLUMNS, episodes)
+    tables = {name: {"columns": columns, "data": data} for name, (columns, data) in tables.items()}
+    return {"cell": cell.description(), "made": MADE, **tables}
+
+
+def make(folder, columns=("paper",), steps=3_000, seeds=2, simulator="highway", **changes):
+    grid = make_grid(parse_columns(list(columns)), simulator, steps, range(seeds))
+    cells = folder / f"{simulator}-{steps}" / "cells"
+    for of_column in grid.values():
+        for cell in of_column:
+            write_result(cell, cells, synthetic(cell, **changes))
+    return collect(grid, cells, simulator, steps)
+
+
+def test_competence(tmp_path):
+    results = make(tmp_path)
+    at_90, at_95 = (steps_to_competence(results.laps, threshold) for threshold in (0.9, 0.95))
+    assert at_90["ddpg_ap:paper"].tolist() == [250, 250]
+    assert at_95["ddpg_ap:paper"].tolist() == [500, 500]
+    assert at_90["ddpg_ap_ce2:paper"].tolist() == [500, 500]
+    assert at_95["ddpg_ap_ce2:paper"].tolist() == [math.inf, math.inf]
+    assert wall_to_competence(results, 0.95)["ddpg_ap:paper"].tolist() == [9, 9]
+    assert wall_to_competence(results, 0.95)["ddpg:paper"].tolist() == [math.inf, math.inf]
+
+
+def test_a_lap_that_is_not_done_is_not_competent(tmp_path):
+    laps = make(tmp_path, ["ddpg_ap:paper"], seeds=1).laps
+    laps.loc[(laps["checkpoint"] == 250) & (laps["track"] == "spring"), "lap_done"] = False
+    assert steps_to_competence(laps, 0.9).tolist() == [500]
+
+
+def test_median_counts_those_that_never_get_there():
+    assert median_reached(pd.Series([250, 500, math.inf])) == (500, 2)
+    assert median_reached(pd.Series([250, math.inf, math.inf])) == (math.inf, 1)
+
+
+def test_measures_of_a_run(tmp_path):
+    runs = per_run(make(tmp_path))
+    ap, ddpg = runs.loc[("ddpg_ap:paper", 1)], runs.loc[("ddpg:paper", 1)]
+    assert (ap["laps_done"], ap["laps"], ddpg["laps_done"]) == (4, 4, 0)
+    assert ap["score"] == pytest.approx(0.962)
+    assert (ap["off_track"], ap["last_off_track"]) == (10, 100)
+    assert ap["ms_per_step"] == pytest.approx(10)
+    assert (ap["accuracy"], ap["lowest_accuracy"]) == pytest.approx((0.8, 0.75))
+    assert np.isnan(ddpg["accuracy"])
+
+
+def test_episodes_are_numbered_and_averaged(tmp_path):
+    episodes = with_averages(make(tmp_path, ["ddpg_ap:paper"], seeds=1).episodes)
+    assert episodes["episode"].tolist() == list(range(1, 12))
+    assert episodes["average_reward"].tolist() == [-20.0] * 10 + [40.0]
+    assert episodes["lost"].tolist() == [True] * 10 + [False]
+
+
+def test_probability_of_improvement():
+    ours, theirs = np.array([[1.0], [3.0]]), np.array([[2.0], [2.0]])
+    assert probability_of_improvement(ours, theirs)[0] == 0.5
+    assert probability_of_improvement(ours, ours + 10) == (0, 0, 0)
+    assert probability_of_improvement(ours, ours)[0] == 0.5  # ties count half
+    p, low, high = probability_of_improvement(np.array([[1.0, 1], [3, 3]]), np.array([[2.0, 0], [2, 0]]))
+    assert p == 0.75
+    assert 0.5 <= low < p < high <= 1
+
+
+def test_guided_columns_are_compared_with_their_base_and_the_best_peer(tmp_path):
+    results = make(tmp_path, ["paper", "ddpg", "sac:tuned"])
+    table = improvement(results)
+    found = {(row.guided, row.against): row.probability for row in table.itertuples()}
+    assert found == {
+        ("ddpg_ap:paper", "ddpg:paper"): 1,
+        ("ddpg_ap:paper", "sac:tuned (best peer)"): 1,
+        ("ddpg_ap_ce2:paper", "ddpg:paper"): 1,
+        ("ddpg_ap_ce2:paper", "sac:tuned (best peer)"): 1,
+    }
+
+
+def report(out, *arguments, name="report"):
+    return main(["benchmark", name, "--simulator", "highway", "--seeds", "2", "--out", str(out), *arguments])
+
+
+def files(folder):
+    return {path.name for path in folder.iterdir() if path.is_file()}
+
+
+def test_all_reports_of_the_runs_that_there_are(tmp_path, capsys):
+    make(tmp_path, ["paper", "linear"])
+    assert report(tmp_path) == 0
+    folder = tmp_path / "highway-3000"
+    figures = ("figure4a", "figure4b", "figure5", "curve")
+    curves = {f"{name}.{kind}" for name in figures for kind in ("png", "svg", "csv")}
+    pages = {f"{name}.md" for name in ("table2", "figure4", "figure5", "curve", "summary")}
+    assert files(folder) == curves | pages | {"table2.csv", "summary.csv", "summary_improvement.csv"}
+    assert "ablations is left out" in capsys.readouterr().out
+    for name in figures:
+        with Image.open(folder / f"{name}.png") as image:
+            assert len(image.convert("RGB").getcolors(1 << 24)) > 10
+
+    assert "| not run |" in (tmp_path / "highway-claims.md").read_text()
+    table = (folder / "table2.md").read_text()
+    assert "| E-road | ddpg_ap:paper | 2 of 2 | 100.0% | 961 | 0.961 [0.960, 0.962] | yes | 49,174 | 0.838 |" in table
+    assert "| E-road | ddpg:paper | 0 of 2 | 40.2% | 201 | 0.201 [0.200, 0.202] | no (17.6%) | 4,461 | 0.076 |" in table
+    assert "Made by `sb3-sap benchmark table2 --simulator highway --steps 3000 --seeds 2`, from 10 runs" in table
+    assert "of 2020-01-02, revision abc, on a machine, one thread each. python 3.11." in table
+    rows = pd.read_csv(folder / "table2.csv")
+    assert len(rows) == 5 * 2 * 4
+    assert set(rows["checkpoint"]) == {3000}
+
+    summary = (folder / "summary.md").read_text()
+    expected = "| ddpg_ap:paper | 2 | 8 of 8 | 0.961 [0.960, 0.962] | 0.960 | 250 (2 of 2) | 500 (2 of 2) | 9 (2 of 2) "
+    assert expected + "| 10 | 100 | 10.0 | 0.800 (0.750) |" in summary
+    assert "| linear | 1 | 4 of 4 | 0.900 | 0.900 | 0 (1 of 1) | – (0 of 1) | – (0 of 1) |  |  |  |  |" in summary
+    assert "Runs that were not made: 2 of ddpg_ap:default" in summary
+
+
+@pytest.mark.slow
+def test_the_same_runs_give_the_same_bytes(tmp_path):
+    make(tmp_path, steps=500)
+    found = []
+    for _ in range(2):
+        assert report(tmp_path, "--steps", "500") == 0
+        found.append({path.name: path.read_bytes() for path in (tmp_path / "highway-500").iterdir() if path.is_file()})
+    assert found[0] == found[1]
+
+
+def test_nothing_to_report(tmp_path, capsys):
+    assert report(tmp_path) == 1
+    assert "table2 is left out: there are no results of these columns" in capsys.readouterr().out
+
+
+def test_results_of_other_settings_are_not_taken(tmp_path):
+    make(tmp_path, ["ddpg_ap:paper[alpha=0.5]"])
+    grid = make_grid(parse_columns(["ddpg_ap:paper"]), "highway", 3_000, range(2))
+    with pytest.raises(ValueError, match="no results of these columns"):
+        collect(grid, tmp_path / "highway-3000" / "cells", "highway", 3_000)
+
+
+def verdicts(folder, **changes):
+    table = judged({steps: make(folder, steps=steps, **changes) for steps in (3_000, 15_000)})
+    return {row["the paper says"]: (row["ours"], row["verdict"]) for _, row in table.iterrows()}
+
+
+def test_claims(tmp_path):
+    found = verdicts(tmp_path)
+    good, bad = "**reproduced**", "not reproduced"
+    stable = "Fig. 4a: it gets stable more quickly, around 2,500 steps."
+    # DDPG-AP and DDPG-(AP+CE2) are stable from step 300 on, both, so that neither comes before all others.
+    assert found[stable][1] == bad
+    assert "ddpg_ap 300" in found[stable][0]
+    assert "ddpg never" in found[stable][0]
+    expected = {
+        "Fig. 4b: DDPG took more than 120 episodes to drive a considerable distance.": ("ddpg 131", good),
+        "Fig. 4b: DDPG-AP never goes off the track after 25 episodes.": ("median 10, 2 of 2 seeds within 25", good),
+        "Fig. 5: the accuracy is always above 70 %.": ("lowest 75.0%; 100% of the points at or above 70 %", good),
+        "Fig. 5: it is 80 % on average.": ("80.0%", good),
+        "Table 2, 3k: DDPG completes no lap.": ("0 of 8", good),
+        "Table 2, 3k: DDPG-CE1 completes the laps with very low reward.": (
+            "8 of 8 laps, 52% of DDPG-AP's reward",
+            good,
+        ),
+        "Table 2, 3k: DDPG-CE2 completes all but Spring.": ("Spring 2 of 2, others 6 of 6", bad),
+        "Table 2, 15k: DDPG-AP has the highest total reward on all test tracks.": (
+            ", ".join(f"{track}: ddpg_ap" for track in TEST_TRACKS),
+            good,
+        ),
+    }
+    assert {sentence: found[sentence] for sentence in expected} == expected
+    assert len(found) == len(CLAIMS)
+
+
+def test_claims_of_a_worse_predictor(tmp_path):
+    found = verdicts(tmp_path, accuracy=0.72)
+    assert found["Fig. 5: the accuracy is always above 70 %."] == (
+        "lowest 67.0%; 100% of the points at or above 70 %",
+        "not reproduced",
+    )
+    assert found["Fig. 5: it is 80 % on average."] == ("72.0%", "not reproduced")
+
+
+def test_claims_page_says_what_was_not_run(tmp_path):
+    claims({3_000: make(tmp_path, seeds=1)}, tmp_path / "claims.md", "sb3-sap benchmark claims")
+    page = (tmp_path / "claims.md").read_text()
+    assert page.count("| not run |") == sum(claim.steps == 15_000 for claim in CLAIMS)
+    assert "Made by `sb3-sap benchmark claims`, from 5 runs" in page

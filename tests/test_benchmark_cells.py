@@ -123,6 +123,16 @@ def test_a_grid_has_every_seed_and_the_linear_controller_once():
     }
 
 
+def test_a_parameter_added_since_leaves_results_valid_and_a_default_changed_since_does_not(tmp_path):
+    cell = make_cell(parse_column("ddpg_ap:default"), "torcs", 300, 0)
+    older = {name: value for name, value in cell.defaults.items() if name != "alpha_low"}
+    result = {"cell": cell.description() | {"defaults": older}}
+    write_result(cell, tmp_path, result)
+    assert read_result(cell, tmp_path) == result
+    write_result(cell, tmp_path, {"cell": cell.description() | {"defaults": older | {"alpha": 0.8}}})
+    assert read_result(cell, tmp_path) is None
+
+
 def test_a_result_is_found_by_its_whole_description(tmp_path):
     here = cell("ddpg")
     write_result(here, tmp_path, {"cell": here.description()})

@@ -46,7 +46,7 @@ class Cell:
 
     def path(self, folder: Path) -> Path:
         """Where the result is kept; cells that differ in the seed alone have names that differ in the seed alone."""
-        text = json.dumps(self.description() | {"seed": None}, sort_keys=True)
+        text = json.dumps(self.description() | {"seed": None, "defaults": None}, sort_keys=True)
         return folder / f"{self.algo}-{hashlib.sha256(text.encode()).hexdigest()[:10]}-seed{self.seed}.json"
 
 
@@ -83,7 +83,14 @@ def read_result(cell: Cell, folder: Path) -> dict[str, Any] | None:
         return None
     except ValueError as error:
         raise ValueError(f"{path} is not the result of a cell ({error}): delete it, and it is made again.") from error
-    return result if result.get("cell") == cell.description() else None
+    return result if _same(result.get("cell", {}), cell.description()) else None
+
+
+def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two descriptions are of the same run: a parameter that only one constructor knows was not used."""
+    shared = one.get("defaults", {}).keys() & other["defaults"].keys()
+    changed = any(one["defaults"][name] != other["defaults"][name] for name in shared)
+    return not changed and one | {"defaults": None} == other | {"defaults": None}
 
 
 def write_result(cell: Cell, folder: Path, result: dict[str, Any]) -> None:

@@ -4,6 +4,12 @@ BIN := .venv/bin
 # Networks this small train no faster on two threads; two processes side by side do.
 export OMP_NUM_THREADS ?= 1
 
+# RL Zoo, in two steps: parts of it ask for a pillow and a python-dateutil older than the pinned ones, with which they
+# work as well, and pip would refuse. `pip install sb3-sap[zoo]`, without the pins, takes the older ones.
+ZOO := rl_zoo3 sb3-team-hf-integration moviepy pytablewriter DataProperty tabledata typepy
+ZOO_NEEDS := optuna requests seaborn shimmy huggingface_hub wasabi mbstrdecoder pathvalidate tcolorpy ImageIO \
+	imageio-ffmpeg proglog python-dotenv decorator "psycopg[binary]"
+
 .PHONY: demo test test-all torcs lint coverage clean
 
 demo: .venv/.installed
@@ -29,7 +35,8 @@ coverage: .venv/.installed
 
 .venv/.installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e .[dev]
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e .[dev] $(ZOO_NEEDS)
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt --no-deps $(ZOO)
 	touch $@
 
 clean:

@@ -19,7 +19,7 @@ FLOORS = (
     {"exploration"},
     {"learning"},
     {"constraints", "callbacks", "buffers", "knowledge", "predictor", "settings", "actor_loss"},
-    {"permissibility", "generators", "files"},
+    {"permissibility", "generators", "files", "errors"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}
 

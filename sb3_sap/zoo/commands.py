@@ -78,7 +78,7 @@ def _with_defaults(command: str, rest: list[str], given: Namespace) -> list[str]
 
 def _given(rest: list[str]) -> Namespace:
     """Those of RL Zoo's flags that have to be known beforehand."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = ArgumentParser(prog="sb3-sap", usage="sb3-sap COMMAND [flags]", add_help=False, allow_abbrev=False)
     for flag in ("--algo", "--storage", "--study-name"):
         parser.add_argument(flag)
     for flag in ("--seed", "--trial-id"):

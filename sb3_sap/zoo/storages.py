@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +16,7 @@ from optuna.samplers import BaseSampler
 from optuna.storages import BaseStorage, JournalStorage, RetryHeartbeatStaleTrialCallback
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.exc import SQLAlchemyError
 
 #: A trial whose workers die is tried so many times again.
 MAX_RETRIES = 3
@@ -44,10 +47,25 @@ def open_storage(storage: str | None, heartbeat: int | None = None) -> BaseStora
                 f"`--storage` {storage!r} is neither a database URL (sqlite:///study.db), nor a Journal file "
                 "(study.log), nor a proxy (grpc://host:port)."
             )
-        retry = RetryHeartbeatStaleTrialCallback(max_retry=MAX_RETRIES)
-        return optuna.storages.RDBStorage(
-            storage, heartbeat_interval=heartbeat, heartbeat_stale_trial_callback=retry if heartbeat else None
-        )
+        return _open_database(storage, heartbeat)
+
+
+def _open_database(url: str, heartbeat: int | None, attempts: int = 10) -> BaseStorage:
+    retry = RetryHeartbeatStaleTrialCallback(max_retry=MAX_RETRIES) if heartbeat else None
+    try:
+        return optuna.storages.RDBStorage(url, heartbeat_interval=heartbeat, heartbeat_stale_trial_callback=retry)
+    except (SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
+        # Workers that begin together all create the tables of a new database, and all but one of them fail.
+        if "already exists" in str(error) and attempts > 1:
+            time.sleep(1)
+            return _open_database(url, heartbeat, attempts - 1)
+        reason = str(error).splitlines()[0]
+        raise OSError(f"`--storage` {without_password(url)} cannot be opened: {reason}") from error
+
+
+def without_password(text: str) -> str:
+    """Database URLs within a text, fit to be shown."""
+    return re.sub(r"(://[^:/@\s]+):[^@\s]+@", r"\1:***@", text)
 
 
 def load_study(storage: str, study_name: str) -> optuna.Study:
@@ -58,7 +76,7 @@ def load_study(storage: str, study_name: str) -> optuna.Study:
     except KeyError as error:
         names = optuna.get_all_study_names(opened)
         known = f"it holds {', '.join(map(repr, names))}" if names else "it is empty"
-        raise ValueError(f"There is no study {study_name!r} in {storage}: {known}.") from error
+        raise ValueError(f"There is no study {study_name!r} in {without_password(storage)}: {known}.") from error
 
 
 def is_surplus(study: optuna.Study, number: int, max_total_trials: int) -> bool:

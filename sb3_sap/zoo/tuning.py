@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import os
+import platform
 import time
 from pprint import pformat
 from typing import Any
@@ -27,7 +29,7 @@ from sb3_sap.zoo.manager import GuidedExperimentManager
 from sb3_sap.zoo.options import StudyOptions, check_validation_tracks
 from sb3_sap.zoo.report import write_report
 from sb3_sap.zoo.spaces import t_k_range
-from sb3_sap.zoo.storages import FINISHED, LIVE, is_surplus, open_storage
+from sb3_sap.zoo.storages import FINISHED, LIVE, is_surplus, open_storage, without_password
 
 #: s between two looks at the trials of other workers.
 POLL = 2.0
@@ -115,6 +117,7 @@ class StudyManager(GuidedExperimentManager):
         # A trial that another worker left behind keeps its seed.
         seed = trial.user_attrs.get("seed", self.seed + trial.number)
         trial.set_user_attr("seed", seed)
+        trial.set_user_attr("worker", f"{platform.node()}:{os.getpid()}")
         sampled = HYPERPARAMS_SAMPLER[self.algo](trial, self.n_actions, self.n_envs, self._sampler_arguments())
         eval_env, model = self.create_envs(self.n_eval_envs, eval_env=True), self.build(sampled, seed)
         path = f"{self.optimization_log_path}/trial_{trial.number}" if self.optimization_log_path else None
@@ -190,7 +193,7 @@ class StudyManager(GuidedExperimentManager):
     def _describe(self, study: optuna.Study) -> None:
         if "command" in study.user_attrs:
             return
-        study.set_user_attr("command", self.options.command)
+        study.set_user_attr("command", without_password(self.options.command))
         study.set_user_attr("algo", self.algo)
         study.set_user_attr("env", self.env_name.gym_id)
         study.set_user_attr("n_timesteps", self.n_timesteps)

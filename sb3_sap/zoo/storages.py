@@ -79,6 +79,13 @@ def load_study(storage: str, study_name: str) -> optuna.Study:
         raise ValueError(f"There is no study {study_name!r} in {without_password(storage)}: {known}.") from error
 
 
+def reap(study: optuna.Study) -> None:
+    """Gives up the trials of workers that died, which are then waiting to be run again."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        optuna.storages.fail_stale_trials(study)
+
+
 def is_surplus(study: optuna.Study, number: int, max_total_trials: int) -> bool:
     """Whether enough trials came before this one.
 

@@ -13,7 +13,6 @@ import numpy as np
 import optuna
 from huggingface_sb3 import EnvironmentName
 from optuna.pruners import BasePruner, MedianPruner, SuccessiveHalvingPruner
-from optuna.storages import fail_stale_trials
 from optuna.trial import TrialState
 from rl_zoo3 import ALGOS
 from rl_zoo3.callbacks import TrialEvalCallback
@@ -29,7 +28,7 @@ from sb3_sap.zoo.manager import GuidedExperimentManager
 from sb3_sap.zoo.options import StudyOptions, check_validation_tracks
 from sb3_sap.zoo.report import write_report
 from sb3_sap.zoo.spaces import t_k_range
-from sb3_sap.zoo.storages import FINISHED, LIVE, is_surplus, open_storage, without_password
+from sb3_sap.zoo.storages import FINISHED, LIVE, is_surplus, open_storage, reap, without_password
 
 #: s between two looks at the trials of other workers.
 POLL = 2.0
@@ -204,7 +203,7 @@ class StudyManager(GuidedExperimentManager):
         """Runs trials until that many are finished, by whichever worker; those of workers that died are run again."""
         told = False
         while True:
-            fail_stale_trials(study)
+            reap(study)
             trials = study.get_trials(deepcopy=False, states=LIVE)
             if sum(trial.state in FINISHED for trial in trials) >= max_total_trials:
                 return

@@ -1,10 +1,12 @@
 """RL Zoo's commands as a user types them, with runs of some ten steps: what they leave, and what they say is wrong."""
 
 import io
+import os
 import re
 from contextlib import redirect_stdout
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
@@ -18,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
 from sb3_sap import DDPGAP  # noqa: E402
 from sb3_sap.algorithms import ALGORITHMS  # noqa: E402
 from sb3_sap.cli import main  # noqa: E402
+from sb3_sap.evaluation import ENVIRONMENTS, drive_lap, load_policy  # noqa: E402
 from sb3_sap.exploration import ActionPermissibilityMixin  # noqa: E402
 from sb3_sap.presets import load_config  # noqa: E402
 from sb3_sap.zoo.configs import check_hyperparameters  # noqa: E402
@@ -327,6 +330,13 @@ def test_a_tuned_noise_of_none_is_loaded():
     assert main([*command, "--study-name", "study"]) == 0
 
 
+def test_a_study_of_something_else_is_not_continued(capsys):
+    study = optuna.create_study(study_name="study", storage=open_storage("study.log"))
+    study.set_user_attr("algo", "sac_ap")
+    assert optimize("--storage", "study.log") == 1
+    assert "is one of sac_ap on sap/LaneKeeping-v0, not of ddpg_ap" in capsys.readouterr().err
+
+
 def test_help_tells_ours_and_theirs(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["optimize", "--help"])
@@ -361,6 +371,36 @@ def test_watching_filming_and_plotting(capsys):
     capsys.readouterr()
     assert main(["enjoy", "--env", ENV, "--no-render", "--exp-id", "7"]) == 1
     assert "was not found" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("simulator", ["highway", "torcs"])
+def test_a_study_maximises_the_score_of_laps(simulator):
+    """The value of a trial is the mean of what `sb3-sap evaluate` says of the model that it saved."""
+    if simulator == "torcs":
+        try:
+            gym.make(ENVIRONMENTS["torcs"])
+        except (OSError, RuntimeError) as error:
+            if os.environ.get("SB3_SAP_REQUIRE_TORCS"):
+                raise
+            pytest.skip(str(error))
+    tracks = ["random:3", "random:4"] if simulator == "highway" else ["g-track-1", "e-track-1"]
+    command = ["optimize", "--env", ENVIRONMENTS[simulator], "--validation-tracks", *tracks, "-n", "100"]
+    command += [
+        "--n-trials",
+        "1",
+        "--study-name",
+        "laps",
+        "--storage",
+        "study.log",
+        "--optimization-log-path",
+        "trials",
+    ]
+    assert main([*command, "--guidance-only", "--no-optim-plots", "-params", *QUICK]) == 0
+    [trial] = optuna.load_study(study_name="laps", storage=open_storage("study.log")).trials
+    policy = load_policy(Path("trials/trial_0/best_model.zip"))
+    scores = [drive_lap(policy, track, simulator).score for track in tracks]
+    assert trial.value == pytest.approx(np.mean(scores), abs=1e-5)
 
 
 @pytest.mark.slow

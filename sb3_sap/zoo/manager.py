@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sap.exploration import ActionPermissibilityMixin
 from sb3_sap.zoo.configs import SCHEDULES, check_file, check_hyperparameters, packaged
-from sb3_sap.zoo.storages import SeededByTrial, load_study
+from sb3_sap.zoo.storages import SeededByTrial, check_belongs, load_study
 
 
 class CallbacksEndingOnce(CallbackList):
@@ -70,6 +70,7 @@ class GuidedExperimentManager(ExperimentManager):
     ) -> dict[str, Any]:
         # It knows two kinds of storage, and answers an unknown number with an IndexError.
         study = load_study(storage, study_name)
+        check_belongs(study, self.algo, self.env_name.gym_id)
         trials = {trial.number: trial for trial in study.trials}
         number = study.best_trial.number if trial_id is None else int(trial_id)
         if number not in trials:

@@ -15,7 +15,7 @@ from sb3_sap.files import atomic_path
 from sb3_sap.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
 from sb3_sap.zoo import figures
 from sb3_sap.zoo.report import markdown_table, shown, target_name
-from sb3_sap.zoo.storages import load_study
+from sb3_sap.zoo.storages import check_belongs, load_study
 from sb3_sap.zoo.tuning import StudyManager
 
 DEFAULT = "default"
@@ -28,6 +28,7 @@ class RetestManager(StudyManager):
         if not (self.storage and self.study_name):
             raise ValueError("`retest` needs a study: give `--storage` and `--study-name`.")
         study = load_study(self.storage, self.study_name)
+        check_belongs(study, self.algo, self.env_name.gym_id)
         self._follow(study)
         folder = self.options.out or Path(self.log_folder) / self.algo / f"retest_{self.env_name}_{self.study_name}"
         rows = self._train_all(arms(study, self.algo, self.options.best), folder / "retest.csv")

@@ -79,6 +79,16 @@ def load_study(storage: str, study_name: str) -> optuna.Study:
         raise ValueError(f"There is no study {study_name!r} in {without_password(storage)}: {known}.") from error
 
 
+def check_belongs(study: optuna.Study, algo: str, env_id: str) -> None:
+    """Refuses a study of something else."""
+    told = study.user_attrs.get("algo", algo), study.user_attrs.get("env", env_id)
+    if told != (algo, env_id):
+        raise ValueError(
+            f"The study {study.study_name!r} is one of {told[0]} on {told[1]}, not of {algo} on {env_id}: give another "
+            "`--study-name`."
+        )
+
+
 def reap(study: optuna.Study) -> None:
     """Gives up the trials of workers that died, which are then waiting to be run again."""
     with warnings.catch_warnings():

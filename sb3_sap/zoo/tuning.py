@@ -15,7 +15,6 @@ from huggingface_sb3 import EnvironmentName
 from optuna.pruners import BasePruner, MedianPruner, SuccessiveHalvingPruner
 from optuna.trial import TrialState
 from rl_zoo3 import ALGOS
-from rl_zoo3.callbacks import TrialEvalCallback
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_callback_list
 from stable_baselines3 import HerReplayBuffer
@@ -27,8 +26,9 @@ from sb3_sap.zoo import laps
 from sb3_sap.zoo.manager import GuidedExperimentManager
 from sb3_sap.zoo.options import StudyOptions, check_validation_tracks
 from sb3_sap.zoo.report import write_report
+from sb3_sap.zoo.reporting import ReportingCallback
 from sb3_sap.zoo.spaces import t_k_range
-from sb3_sap.zoo.storages import FINISHED, LIVE, is_surplus, open_storage, reap, without_password
+from sb3_sap.zoo.storages import FINISHED, LIVE, check_belongs, is_surplus, open_storage, reap, without_password
 
 #: s between two looks at the trials of other workers.
 POLL = 2.0
@@ -36,35 +36,6 @@ POLL = 2.0
 
 class SurplusTrial(Exception):
     """Another worker began the last trial of the study at the same moment."""
-
-
-class ReportingCallback(TrialEvalCallback):
-    """Reports evaluations by training step, asks the pruner only once E guides, and never ends without a verdict."""
-
-    def _on_step(self) -> bool:
-        if self.n_calls % self.eval_freq != 0:
-            return True
-        self._report()
-        if self._guided() and self.trial.should_prune():
-            self.is_pruned = True
-        return not self.is_pruned
-
-    def _on_training_end(self) -> None:
-        if not self.is_pruned and self.n_calls % self.eval_freq != 0:
-            self._report()
-
-    def _report(self) -> None:
-        # What EvalCallback does at a multiple of its frequency, now.
-        frequency, self.eval_freq = self.eval_freq, 1
-        super(TrialEvalCallback, self)._on_step()
-        self.eval_freq = frequency
-        self.trial.report(self.last_mean_reward, self.num_timesteps)
-
-    def _guided(self) -> bool:
-        model = self.model
-        if not isinstance(model, ActionPermissibilityMixin):
-            return True
-        return model.predictor.fitted and self.num_timesteps > model.noise_steps
 
 
 class StudyManager(GuidedExperimentManager):
@@ -190,6 +161,7 @@ class StudyManager(GuidedExperimentManager):
         print(f"The report is in {folder}")
 
     def _describe(self, study: optuna.Study) -> None:
+        check_belongs(study, self.algo, self.env_name.gym_id)
         if "command" in study.user_attrs:
             return
         study.set_user_attr("command", without_password(self.options.command))

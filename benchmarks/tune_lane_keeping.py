@@ -26,7 +26,13 @@ from sb3_sap.evaluation import drive_lap
 BASES = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC, "crossq": CrossQ}
 VALIDATION_TRACKS = ("g-track-1", "aalborg", "e-track-1")
 CHECKPOINTS = (250, 500, 750, 1_000)
-NETS = {"64-64": [64, 64], "128-256": [128, 256], "256-256": [256, 256], "400-300": [400, 300], "1024-1024": [1024, 1024]}
+NETS = {
+    "64-64": [64, 64],
+    "128-256": [128, 256],
+    "256-256": [256, 256],
+    "400-300": [400, 300],
+    "1024-1024": [1024, 1024],
+}
 GOOD_GUESS = {"gamma": 0.9, "learning_rate": 1e-3, "net": "128-256"}
 
 

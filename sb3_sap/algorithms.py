@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 from sb3_contrib import QRDQN, TQC, CrossQ
 from stable_baselines3 import DDPG as PlainDDPG
 from stable_baselines3 import DQN, SAC, TD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.constraints import ActionConstraint, ConstrainedExplorationMixin
 from sb3_sap.exploration import ActionPermissibilityMixin
@@ -88,3 +89,20 @@ class QRDQNAP(ActionPermissibilityMixin, QRDQN):
 
     discrete: ClassVar[bool] = True
     stochastic_policy: ClassVar[bool] = True
+
+
+#: Every algorithm by its RL Zoo name. Commands, the zoo and its search spaces read this table: a further algorithm is
+#: one line here and one file in ``zoo_configs``.
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
+    "ddpg": DDPG,
+    "ddpg_ce1": DDPGCE1,
+    "ddpg_ce2": DDPGCE2,
+    "ddpg_ap": DDPGAP,
+    "ddpg_ap_ce2": DDPGAPCE2,
+    "td3_ap": TD3AP,
+    "sac_ap": SACAP,
+    "tqc_ap": TQCAP,
+    "crossq_ap": CrossQAP,
+    "dqn_ap": DQNAP,
+    "qrdqn_ap": QRDQNAP,
+}

@@ -9,26 +9,22 @@ from pathlib import Path
 import torch as th
 from rich.console import Console
 
-from sb3_sap import __version__
+from sb3_sap import __version__, zoo
 from sb3_sap.benchmark.cli import add_benchmark
 from sb3_sap.envs.torcs.cli import add_torcs
+from sb3_sap.errors import run_command
 from sb3_sap.evaluation import ENVIRONMENTS
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code; what the user got wrong is told in one sentence."""
-    options = parser().parse_args(arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
     # Networks this small run no faster on two threads, and one thread always adds in the same order.
     th.set_num_threads(1)
-    try:
-        code: int = options.run(options, Console())
-    except KeyboardInterrupt:
-        print("sb3-sap: interrupted; what was written so far is kept.", file=sys.stderr)
-        return 130
-    except (ValueError, TypeError, OSError, RuntimeError) as error:
-        print(f"sb3-sap: error: {error}", file=sys.stderr)
-        return 1
-    return code
+    if arguments and arguments[0] in zoo.COMMANDS:
+        return zoo.main(arguments)  # RL Zoo reads its flags itself
+    options = parser().parse_args(arguments)
+    return run_command(lambda: int(options.run(options, Console())))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -40,11 +36,14 @@ def parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     add_benchmark(commands)
     add_torcs(commands)
+    for name, summary in zoo.COMMANDS.items():
+        commands.add_parser(name, help=summary, add_help=False)
     return root
 
 
 def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    from sb3_sap.demo import ALGORITHMS, Run
+    from sb3_sap.algorithms import ALGORITHMS
+    from sb3_sap.demo import Run
 
     default = Run()
     command = commands.add_parser(

@@ -16,23 +16,15 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sap import algorithms, plots
+from sb3_sap import plots
+from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
 from sb3_sap.envs import TRACKS
 from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive, drive_lap, write_results
 from sb3_sap.files import atomic_path
 from sb3_sap.presets import preset
 
-#: The paper's five, by their RL Zoo names.
-ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
-    "ddpg": algorithms.DDPG,
-    "ddpg_ce1": algorithms.DDPGCE1,
-    "ddpg_ce2": algorithms.DDPGCE2,
-    "ddpg_ap": algorithms.DDPGAP,
-    "ddpg_ap_ce2": algorithms.DDPGAPCE2,
-}
 #: km/h, the default speed of the task.
 SPEED = 50.0
 #: Control steps shown in the animation (30 s of driving), and pictures per second: twice real time.

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-import difflib
 from importlib import resources
 from typing import Any
 
 import yaml
 
+from sb3_sap.errors import nearest
+
 #: Keys of RL Zoo's format that tell its runner, not the algorithm's constructor, what to do.
 RUNNER_KEYS = frozenset(
-    {"n_timesteps", "policy", "n_envs", "normalize", "env_wrapper", "vec_env_wrapper", "frame_stack", "callback"}
+    {
+        "callback",
+        "env_kwargs",
+        "env_wrapper",
+        "frame_stack",
+        "monitor_kwargs",
+        "n_envs",
+        "n_timesteps",
+        "noise_std",
+        "noise_type",
+        "normalize",
+        "policy",
+        "vec_env_wrapper",
+    }
 )
 #: The paper chose t_k by the length of the run: up to so many steps, entries named ``<preset>-3k`` hold.
 SHORT_RUN = 3_000
@@ -51,6 +65,4 @@ def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[s
 
 def _check(argument: str, value: str, known: list[str]) -> None:
     if value not in known:
-        near = difflib.get_close_matches(value, known, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(map(repr, known))}."
-        raise ValueError(f"`{argument}` = {value!r} is unknown: {hint}")
+        raise ValueError(f"`{argument}` = {value!r} is unknown: {nearest(value, known)}")

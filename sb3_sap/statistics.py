@@ -22,11 +22,7 @@ def bootstrap_interval(
 
     :param scores: (runs, tasks)
     """
-    rng = np.random.default_rng(seed)
-    n_runs, n_tasks = scores.shape
-    chosen = rng.integers(n_runs, size=(resamples, n_runs, n_tasks))
-    resampled = scores[chosen, np.arange(n_tasks)]  # (resamples, runs, tasks)
-    means = stats.trim_mean(resampled.reshape(resamples, -1), 0.25, axis=1)
+    means = _resampled_means(np.random.default_rng(seed), scores, resamples)
     tail = (1 - confidence) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
     return float(low), float(high)
@@ -56,3 +52,26 @@ def _share_of_wins(ours: FloatArray, theirs: FloatArray) -> Any:
     """Over all pairs of runs and all tasks; (…, runs, tasks) each."""
     difference = ours[..., :, None, :] - theirs[..., None, :, :]  # (…, our runs, their runs, tasks)
     return ((np.sign(difference) + 1) / 2).mean(axis=(-3, -2, -1))
+
+
+def bootstrap_difference(
+    scores: FloatArray, others: FloatArray, confidence: float = 0.95, resamples: int = 2_000, seed: int = 0
+) -> tuple[float, float, float]:
+    """Difference of two interquartile means with its interval; both are resampled, each within its tasks.
+
+    :param scores: (runs, tasks)
+    :param others: (runs, tasks), what is subtracted
+    """
+    rng = np.random.default_rng(seed)
+    differences = _resampled_means(rng, scores, resamples) - _resampled_means(rng, others, resamples)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(differences, [tail, 1 - tail])
+    return interquartile_mean(scores) - interquartile_mean(others), float(low), float(high)
+
+
+def _resampled_means(rng: np.random.Generator, scores: FloatArray, resamples: int) -> FloatArray:
+    n_runs, n_tasks = scores.shape
+    chosen = rng.integers(n_runs, size=(resamples, n_runs, n_tasks))
+    resampled = scores[chosen, np.arange(n_tasks)]  # (resamples, runs, tasks)
+    means: FloatArray = stats.trim_mean(resampled.reshape(resamples, -1), 0.25, axis=1)
+    return means

@@ -29,7 +29,7 @@ FLOORS = (
         "candidates",
         "prediction",
     },
-    {"permissibility", "generators", "files"},
+    {"permissibility", "generators", "files", "errors"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}
 

@@ -4,10 +4,11 @@ from importlib import resources
 
 import gymnasium as gym
 import pytest
+from toy import DISCRETE
 
 from sb3_sap import DDPGAP
+from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.learners import CLASSES
-from sb3_sap.demo import ALGORITHMS
 from sb3_sap.presets import algorithms, load_config, preset, preset_names
 
 PAPER = {
@@ -66,11 +67,12 @@ def test_preset_as_typed():
     assert model.critic.optimizer.param_groups[0]["lr"] == 0.001
 
 
-def test_every_config_is_installed_and_has_an_algorithm():
+def test_every_algorithm_has_a_config_that_is_installed():
     assert set(ALGORITHMS) <= set(algorithms()) <= set(CLASSES)
     for algo in ALGORITHMS:
-        assert "paper" in preset_names(algo)
-        assert "sap/LaneKeeping-v0" in load_config(algo)
+        assert ("paper" in preset_names(algo)) == algo.startswith("ddpg")
+        steering = {"sap/LaneKeeping-v0", "sap/TorcsLaneKeeping-v0"}
+        assert {"default"} | (set() if ALGORITHMS[algo] in DISCRETE else steering) <= load_config(algo).keys()
     assert (resources.files("sb3_sap") / "zoo_configs" / "ddpg_ap.yml").is_file()
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_sap.statistics import bootstrap_interval, interquartile_mean
+from sb3_sap.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
 
 
 def test_interquartile_mean_drops_a_quarter_at_each_end():
@@ -20,3 +20,11 @@ def test_interval_holds_the_mean_and_resamples_within_tasks():
     assert low < interquartile_mean(scores) < high
     # Tasks that differ only between each other leave nothing to resample.
     assert bootstrap_interval(np.tile([0.0, 1.0, 2.0, 3.0], (10, 1))) == (1.5, 1.5)
+
+
+def test_difference_of_shifted_runs_is_the_shift():
+    scores = np.random.default_rng(0).normal(0.5, 0.1, (10, 3))
+    difference, low, high = bootstrap_difference(scores + 1, scores)
+    assert difference == pytest.approx(1)
+    assert low < 1 < high
+    assert bootstrap_difference(np.full((5, 2), 0.9), np.full((5, 2), 0.4)) == pytest.approx((0.5, 0.5, 0.5))

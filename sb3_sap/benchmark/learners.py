@@ -10,26 +10,18 @@ from typing import Any
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.columns import Column, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
 from sb3_sap.presets import preset
 from sb3_sap.settings import SettingsMixin, make_action_noise
 
 #: The class of each algorithm, imported only when it is needed.
-CLASSES = {
-    "ddpg": "sb3_sap:DDPG",  # SB3's to the bit, unless the actor has a learning rate of its own
+CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
     "td3": "stable_baselines3:TD3",
     "sac": "stable_baselines3:SAC",
     "tqc": "sb3_contrib:TQC",
     "crossq": "sb3_contrib:CrossQ",
-    "ddpg_ce1": "sb3_sap:DDPGCE1",
-    "ddpg_ce2": "sb3_sap:DDPGCE2",
-    "ddpg_ap": "sb3_sap:DDPGAP",
-    "ddpg_ap_ce2": "sb3_sap:DDPGAPCE2",
-    "td3_ap": "sb3_sap:TD3AP",
-    "sac_ap": "sb3_sap:SACAP",
-    "tqc_ap": "sb3_sap:TQCAP",
-    "crossq_ap": "sb3_sap:CrossQAP",
     "sbx_ddpg": "sbx:DDPG",
     "sbx_td3": "sbx:TD3",
     "sbx_sac": "sbx:SAC",

@@ -1,0 +1,26 @@
+"""What the user got wrong, told in one sentence."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Callable, Iterable
+
+
+def run_command(command: Callable[[], int]) -> int:
+    """Runs a command and returns its exit code; an error that the user can mend becomes one sentence."""
+    try:
+        return command()
+    except KeyboardInterrupt:
+        print("sb3-sap: interrupted; what was written so far is kept.", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
+        print(f"sb3-sap: error: {error}", file=sys.stderr)
+        return 1
+
+
+def nearest(value: object, known: Iterable[str]) -> str:
+    """The end of a sentence that calls ``value`` unknown: the valid name nearest to it, or all of them."""
+    names = list(known)
+    near = difflib.get_close_matches(str(value), names, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(map(repr, names))}."

@@ -1,0 +1,120 @@
+"""Where an algorithm's YAML lies, and what is wrong with one: told in a sentence before anything is built from it."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+from rl_zoo3 import ALGOS
+
+from sb3_sap.errors import nearest
+from sb3_sap.permissibility import resolve
+from sb3_sap.presets import RUNNER_KEYS, algorithms
+
+#: What the words of an annotation admit. An annotation with any other word is left to the constructor.
+KINDS: dict[str, tuple[type, ...]] = {
+    "int": (int,),
+    "float": (int, float),
+    "bool": (bool,),
+    "str": (str,),
+    "None": (type(None),),
+}
+#: Given by name in YAML: classes and functions.
+DOTTED = ("env_wrapper", "vec_env_wrapper", "callback")
+#: rl_zoo3 makes a schedule of numbers and of "lin_0.001".
+SCHEDULES = ("learning_rate", "actor_learning_rate", "actor_permissibility_coef")
+
+
+def packaged(algo: str) -> str | None:
+    """The path of the YAML file that this package brings for an algorithm, if it does."""
+    return str(resources.files("sb3_sap") / "zoo_configs" / f"{algo}.yml") if algo in algorithms() else None
+
+
+def check_algo(algo: str) -> None:
+    """Refuses an algorithm that rl_zoo3 does not know."""
+    if algo not in ALGOS:
+        raise ValueError(f"`--algo` {algo!r} is unknown: {nearest(algo, ALGOS)}")
+
+
+def check_file(path: str) -> None:
+    """Refuses a file that is no mapping of environments to settings, or names an environment of ours wrongly."""
+    file = Path(path)
+    if file.suffix not in (".yml", ".yaml"):
+        return  # Python, which checks itself
+    if not file.is_file():
+        raise FileNotFoundError(f"There is no configuration file {path}.")
+    try:
+        entries = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        where = f" in line {error.problem_mark.line + 1}" if getattr(error, "problem_mark", None) else ""
+        raise ValueError(f"{path} is not YAML{where}: {getattr(error, 'problem', error)}.") from error
+    if not isinstance(entries, Mapping):
+        raise TypeError(f"{path} must hold environments with their settings, but holds a {type(entries).__name__}.")
+    for name, entry in entries.items():
+        if not isinstance(entry, Mapping):
+            raise TypeError(f"{path}: the entry {name!r} must hold settings, `key: value`, but is {entry!r}.")
+        if str(name).startswith("sap/") and name not in gym.registry:
+            ours = [known for known in gym.registry if known.startswith("sap/")]
+            raise ValueError(f"{path}: the environment {name!r} is unknown: {nearest(name, ours)}")
+
+
+def check_hyperparameters(algo: str, hyperparams: Mapping[str, Any], source: str) -> None:
+    """Refuses keys that neither rl_zoo3 nor the algorithm knows, and values of a type that cannot be."""
+    algorithm: Any = ALGOS[algo]
+    parameters = inspect.signature(algorithm).parameters
+    known = (set(parameters) | RUNNER_KEYS) - {"env", "seed", "verbose", "device", "tensorboard_log", "self"}
+    for key, value in hyperparams.items():
+        if key not in known:
+            raise ValueError(f"{source}: the key {key!r} is unknown to {algo}: {nearest(key, sorted(known))}")
+        if key in parameters and key not in RUNNER_KEYS:
+            _check_type(key, value, parameters[key], source)
+        if key in DOTTED:
+            _check_dotted(key, value)
+    if "n_timesteps" in hyperparams:
+        _check_kinds("n_timesteps", hyperparams["n_timesteps"], ["int", "float"], source)  # 1e6 is a float to YAML
+    policy = hyperparams.get("policy", "MlpPolicy")
+    if isinstance(policy, str) and "." not in policy and policy not in algorithm.policy_aliases:
+        raise ValueError(f"{source}: `policy` {policy!r} is unknown: {nearest(policy, algorithm.policy_aliases)}")
+
+
+def _check_type(key: str, value: Any, parameter: inspect.Parameter, source: str) -> None:
+    if key in SCHEDULES:
+        if isinstance(value, str) and not re.fullmatch(r"lin_[0-9.]+(e-?\d+)?", value):
+            raise TypeError(f'{source}: `{key}` must be a number or "lin_<number>", but is {value!r}.{_dot(value)}')
+        return
+    annotation = parameter.annotation
+    words = re.findall(r"\w+", annotation if isinstance(annotation, str) else _words_of(annotation))
+    if words and all(word in KINDS for word in words):
+        _check_kinds(key, value, words, source)
+
+
+def _words_of(annotation: Any) -> str:
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
+
+
+def _check_kinds(key: str, value: Any, kinds: list[str], source: str) -> None:
+    if isinstance(value, bool) and "bool" not in kinds:
+        good = False  # to Python a bool is an int
+    else:
+        good = isinstance(value, tuple(kind for name in kinds for kind in KINDS[name]))
+    if not good:
+        must = " or ".join(dict.fromkeys(kinds))
+        raise TypeError(f"{source}: `{key}` must be {must}, but is {value!r}.{_dot(value)}")
+
+
+def _dot(value: Any) -> str:
+    number = isinstance(value, str) and re.fullmatch(r"\d+e[+-]?\d+", value)
+    return f" YAML reads {value} as text: write it with a point, {value.replace('e', '.0e')}." if number else ""
+
+
+def _check_dotted(key: str, value: Any) -> None:
+    for entry in value if isinstance(value, list) else [value]:
+        name = next(iter(entry)) if isinstance(entry, Mapping) else entry
+        if isinstance(name, str):
+            resolve(name, key)

@@ -1,0 +1,63 @@
+"""Makes the algorithms and their search spaces known to rl_zoo3; ``import sb3_sap`` registers the environments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rl_zoo3 import ALGOS
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_sap.algorithms import ALGORITHMS
+from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.zoo.spaces import (
+    convert_crossq_params,
+    guided_converter,
+    guided_sampler,
+    sample_crossq_params,
+)
+
+#: rl_zoo3's names of the algorithms that ours build on.
+BASES: dict[type, str] = {algorithm: name for name, algorithm in ALGOS.items()}
+
+
+def register() -> None:
+    """Adds every algorithm of this package to rl_zoo3's tables; it does no harm to do so twice."""
+    samplers: dict[str, Any] = HYPERPARAMS_SAMPLER
+    converters: dict[str, Any] = HYPERPARAMS_CONVERTER
+    # rl_zoo3 2.9.2 has no space for CrossQ, which it knows.
+    samplers["crossq"], converters["crossq"] = sample_crossq_params, convert_crossq_params
+    for name, algorithm in ALGORITHMS.items():
+        base = next(BASES[cls] for cls in algorithm.__mro__ if cls in BASES)
+        ALGOS[name], samplers[name], converters[name] = algorithm, samplers[base], converters[base]
+        if issubclass(algorithm, ActionPermissibilityMixin):
+            samplers[name] = guided_sampler(samplers[base], has_actor=not algorithm.discrete)
+            converters[name] = guided_converter(converters[base])
+
+
+@contextmanager
+def small_buffers() -> Iterator[None]:
+    """For commands that train nothing: models are loaded with buffers of next to no size.
+
+    rl_zoo3 2.9.2 does so for the off-policy algorithms that `enjoy` and `record_video` know by name, and allocates the
+    whole buffer of every other.
+    """
+    before = dict(ALGOS)
+    ALGOS.update({name: _watching(cls) for name, cls in before.items() if issubclass(cls, OffPolicyAlgorithm)})
+    try:
+        yield
+    finally:
+        ALGOS.update(before)
+
+
+def _watching(algorithm: type[OffPolicyAlgorithm]) -> type[OffPolicyAlgorithm]:
+    small: dict[str, Any] = {"buffer_size": 1, "optimize_memory_usage": False}
+    if issubclass(algorithm, ActionPermissibilityMixin):
+        small |= {"knowledge_buffer_size": 20, "min_per_class": 1}
+
+    def load(cls: type, *args: Any, **kwargs: Any) -> OffPolicyAlgorithm:
+        return algorithm.load(*args, **kwargs | small)
+
+    return type(algorithm.__name__, (algorithm,), {"load": classmethod(load)})

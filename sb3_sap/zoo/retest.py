@@ -1,0 +1,115 @@
+"""Winners of a study on fresh seeds, beside the configuration's own settings: was it more than luck?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pandas as pd
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_sap.files import atomic_path
+from sb3_sap.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
+from sb3_sap.zoo import figures
+from sb3_sap.zoo.report import markdown_table, shown, target_name
+from sb3_sap.zoo.storages import check_belongs, load_study
+from sb3_sap.zoo.tuning import StudyManager
+
+DEFAULT = "default"
+
+
+class RetestManager(StudyManager):
+    """Trains the best trials and the default anew, instead of tuning."""
+
+    def hyperparameters_optimization(self) -> None:
+        if not (self.storage and self.study_name):
+            raise ValueError("`retest` needs a study: give `--storage` and `--study-name`.")
+        study = load_study(self.storage, self.study_name)
+        check_belongs(study, self.algo, self.env_name.gym_id)
+        self._follow(study)
+        folder = self.options.out or Path(self.log_folder) / self.algo / f"retest_{self.env_name}_{self.study_name}"
+        rows = self._train_all(arms(study, self.algo, self.options.best), folder / "retest.csv")
+        text = summary(rows, study, self.options.tracks or self.options.validation_tracks)
+        with atomic_path(folder / "retest.md") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        print(f"{text}\nThe comparison is in {folder}")
+
+    def _follow(self, study: optuna.Study) -> None:
+        """Evaluates as the study did, unless told otherwise."""
+        told = study.user_attrs.get("n_timesteps", self.n_timesteps)
+        if told != self.n_timesteps:
+            print(f"Note: the study trained {told} steps, this trains {self.n_timesteps}.")
+        tracks = self.options.tracks or self.options.validation_tracks or study.user_attrs.get("validation_tracks", [])
+        self.options.validation_tracks = tracks
+        if tracks:
+            self.n_eval_episodes, self.n_eval_envs = len(tracks), 1
+
+    def _train_all(self, settings: dict[str, dict[str, Any]], path: Path) -> pd.DataFrame:
+        """One row for each run and track; what the file holds already is not trained again."""
+        rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["arm", "seed", "task", "score"])
+        for seed in range(self.seed, self.seed + self.options.runs):  # seed by seed, so that a part is a comparison too
+            for arm, hyperparams in settings.items():
+                if ((rows["arm"] == arm) & (rows["seed"] == seed)).any():
+                    continue
+                scores = self._train(hyperparams, seed)
+                print(f"{arm}, seed {seed}: {np.mean(scores):.4g}", flush=True)
+                tasks = self.options.validation_tracks or [self.env_name.gym_id] * len(scores)
+                new = [{"arm": arm, "seed": seed, "task": t, "score": s} for t, s in zip(tasks, scores, strict=True)]
+                rows = pd.DataFrame([*rows.to_dict("records"), *new])
+                with atomic_path(path) as temporary:
+                    rows.to_csv(temporary, index=False)
+        return rows
+
+    def _train(self, hyperparams: dict[str, Any], seed: int) -> list[float]:
+        model = self.build(hyperparams, seed)
+        model.learn(self.n_timesteps)
+        eval_env = self.create_envs(self.n_eval_envs, eval_env=True)  # a new one begins with the first track
+        normalised = model.get_vec_normalize_env()
+        if normalised is not None:
+            eval_env.obs_rms = normalised.obs_rms  # type: ignore[attr-defined]
+        scores, _ = evaluate_policy(
+            model, eval_env, self.n_eval_episodes, self.deterministic_eval, return_episode_rewards=True
+        )
+        model.env.close()  # type: ignore[union-attr]
+        eval_env.close()
+        return [float(score) for score in scores]  # type: ignore[union-attr]
+
+
+def arms(study: optuna.Study, algo: str, best: int) -> dict[str, dict[str, Any]]:
+    """The default and the best trials, by name: what each changes of the configuration."""
+    done = sorted(figures.completed(study), key=lambda trial: float(trial.value or 0), reverse=True)
+    if not done:
+        raise ValueError(f"No trial of the study {study.study_name!r} has finished.")
+    winners = {f"trial {trial.number}": HYPERPARAMS_CONVERTER[algo](trial.params) for trial in done[:best]}
+    return {DEFAULT: {}, **winners}
+
+
+def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str]) -> str:
+    """The comparison as Markdown: interquartile means with 95 % intervals, and differences to the default."""
+    scores = {arm: _matrix(group) for arm, group in rows.groupby("arm", sort=False)}
+    trials = {f"trial {trial.number}": trial for trial in study.get_trials(deepcopy=False)}
+    table = []
+    for arm, matrix in scores.items():
+        trial = trials.get(str(arm))
+        changed = ", ".join(f"{name} {shown(value)}" for name, value in trial.params.items()) if trial else ""
+        low, high = bootstrap_interval(matrix)
+        row = [arm, changed, shown(trial.value) if trial else "", len(matrix)]
+        row += [f"{interquartile_mean(matrix):.4g} [{low:.4g}, {high:.4g}]"]
+        if arm == DEFAULT or DEFAULT not in scores:
+            row.append("")
+        else:
+            difference, low, high = bootstrap_difference(matrix, scores[DEFAULT])
+            row.append(f"{difference:+.3g} [{low:+.3g}, {high:+.3g}]")
+        table.append(row)
+    header = ["settings", "changed", "in the study", "seeds", "interquartile mean", "minus default"]
+    tasks = f"Laps: {', '.join(tracks)}." if tracks else f"{target_name(study).capitalize()}."
+    lines = [f"# Winners of {study.study_name} on fresh seeds", "", f"{tasks} 95 % stratified bootstrap intervals.", ""]
+    return "\n".join([*lines, *markdown_table(header, table)]) + "\n"
+
+
+def _matrix(rows: pd.DataFrame) -> Any:
+    """(runs, tasks); several episodes on one environment are averaged."""
+    return rows.pivot_table(index="seed", columns="task", values="score", aggfunc="mean").to_numpy()

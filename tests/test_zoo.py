@@ -1,0 +1,422 @@
+"""RL Zoo's commands as a user types them, with runs of some ten steps: what they leave, and what they say is wrong."""
+
+import io
+import os
+import re
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+
+optuna = pytest.importorskip("optuna", reason="RL Zoo is not installed: pip install sb3-sap[zoo]")
+rl_zoo3 = pytest.importorskip("rl_zoo3", reason="RL Zoo is not installed: pip install sb3-sap[zoo]")
+
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER  # noqa: E402
+from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
+
+from sb3_sap import DDPGAP  # noqa: E402
+from sb3_sap.algorithms import ALGORITHMS  # noqa: E402
+from sb3_sap.cli import main  # noqa: E402
+from sb3_sap.evaluation import ENVIRONMENTS, drive_lap, load_policy  # noqa: E402
+from sb3_sap.exploration import ActionPermissibilityMixin  # noqa: E402
+from sb3_sap.presets import load_config  # noqa: E402
+from sb3_sap.zoo.configs import check_hyperparameters  # noqa: E402
+from sb3_sap.zoo.registration import register, small_buffers  # noqa: E402
+from sb3_sap.zoo.spaces import t_k_range  # noqa: E402
+from sb3_sap.zoo.storages import SeededByTrial, is_surplus, open_storage, without_password  # noqa: E402
+
+ENV = "sap/LaneKeeping-v0"
+FOLDER = "sap-LaneKeeping-v0"
+GUIDED = [name for name, cls in ALGORITHMS.items() if issubclass(cls, ActionPermissibilityMixin)]
+#: Small networks, and fits of E from the first steps on.
+QUICK = [
+    "policy_kwargs:dict(net_arch=[8])",
+    "predictor_kwargs:dict(net_arch=[8])",
+    "batch_size:8",
+    "buffer_size:500",
+    "dataset_size:16",
+    "min_per_class:1",
+    "n_candidates:8",
+    "validation_size:8",
+]
+
+register()
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+class CountsEnds(BaseCallback):
+    """Named in YAML by its dotted name."""
+
+    ends = 0
+
+    def _on_step(self):
+        return True
+
+    def _on_training_end(self):
+        type(self).ends += 1
+
+
+# -------------------------------------------------------------------- train, enjoy
+
+
+def test_train_leaves_what_rl_zoo_leaves():
+    command = ["train", "--algo", "ddpg_ap", "--env", ENV, "-n", "60", "--eval-freq", "30", "--eval-episodes", "1"]
+    command += ["--save-freq", "20", "--save-replay-buffer", "--seed", "3", "-P", "-params", "alpha:0.7", *QUICK]
+    assert main(command) == 0
+    run = Path("logs/ddpg_ap") / f"{FOLDER}_1"
+    checkpoints = {f"rl_model_{steps}_steps.zip" for steps in (20, 40, 60)}
+    assert checkpoints | {"best_model.zip", "replay_buffer.pkl", f"{FOLDER}.zip"} <= {
+        path.name for path in run.iterdir()
+    }
+    model = DDPGAP.load(run / f"{FOLDER}.zip")
+    assert (model.alpha, model.t_k, model.seed, model.num_timesteps) == (0.7, 150, 3, 60)
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [30, 60]
+    saved, _ = rl_zoo3.get_saved_hyperparams(str(run / FOLDER))
+    assert saved["alpha"] == 0.7
+
+    again = [
+        "train",
+        "--env",
+        ENV,
+        "-n",
+        "10",
+        "--eval-freq",
+        "-1",
+        "-i",
+        str(run / f"{FOLDER}.zip"),
+        "-params",
+        *QUICK,
+    ]
+    assert main(again) == 0
+    model = DDPGAP.load(Path("logs/ddpg_ap") / f"{FOLDER}_2" / f"{FOLDER}.zip")
+    assert model.num_timesteps == 10
+    assert model._steps_of_earlier_learns == 60  # t_k counts over the model's life
+
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        assert main(["enjoy", "--env", ENV, "--no-render", "-n", "30", "--exp-id", "1", "--load-best"]) == 0
+    assert "best_model.zip" in printed.getvalue()
+
+
+def test_the_default_entry_serves_other_environments():
+    command = ["train", "--algo", "sac_ap", "--env", "MountainCarContinuous-v0", "-n", "20", "--eval-freq", "-1"]
+    command += ["--conf-file", "own.yml", "-params", "policy_kwargs:dict(net_arch=[8])"]
+    settings = {"policy": "MlpPolicy", "n_timesteps": 20, "ap_function": "tests_ap.never", "callback": ["counts.Ends"]}
+    Path("own.yml").write_text(yaml.safe_dump({"default": settings}))
+    assert main(command) == 1  # there are no such modules
+    settings |= {"ap_function": f"{__name__}.all_permissible", "callback": [f"{__name__}.CountsEnds"]}
+    Path("own.yml").write_text(yaml.safe_dump({"default": settings}))
+    CountsEnds.ends = 0
+    assert main(command) == 0
+    assert CountsEnds.ends == 1  # rl_zoo3 tells the first callback twice
+
+
+def all_permissible(obs, actions, next_obs):
+    return np.ones(len(actions), dtype=bool)
+
+
+def test_watching_needs_no_buffers(tmp_path):
+    DDPGAP("MlpPolicy", rl_zoo3.create_test_env(ENV, should_render=False, hyperparams={}), seed=1).save("model")
+    with small_buffers():
+        model = rl_zoo3.ALGOS["ddpg_ap"].load("model")
+    assert (model.replay_buffer.buffer_size, model.buffer_size) == (1, 1)
+    assert rl_zoo3.ALGOS["ddpg_ap"] is DDPGAP
+
+
+# -------------------------------------------------------------------- what is wrong
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--algo", "ddpg_pa"], "`--algo` 'ddpg_pa' is unknown: did you mean 'ddpg_ap'?"),
+        (["--env", "sap/LaneKepping-v0"], "did you mean|maybe meant sap/LaneKeeping-v0"),
+        (["-params", "alfa:0.7"], "the key 'alfa' is unknown to ddpg_ap: did you mean 'alpha'?"),
+        (["-params", "gamma:'high'"], "`gamma` must be float, but is 'high'"),
+        (["-params", "batch_size:12.5"], "`batch_size` must be int, but is 12.5"),
+        (["-params", "alpha:2"], "`alpha` is a probability from 0 to 1, but is 2"),
+        (["-params", "learning_rate:'1e-3'"], "write it with a point, 1.0e-3."),
+        (["-params", "policy:'MlpPolcy'"], "did you mean 'MlpPolicy'?"),
+        (["--conf-file", "nowhere.yml"], "There is no configuration file nowhere.yml"),
+        (["--trial-id", "0"], "give `--storage` and `--study-name`"),
+        (["--validation-tracks", "eroad"], "one of the paper's test tracks"),
+        (["--algo", "ddpg", "--guidance-only"], "which ddpg has not"),
+        (["--storage", "study.sqlite", "--study-name", "x", "--trial-id", "0"], "neither a database URL"),
+        (["--storage", "sqlite:///empty.db", "--study-name", "x", "--trial-id", "0"], "There is no study 'x'"),
+        (["--storage", "sqlite:////no/folder/x.db", "--study-name", "x", "--trial-id", "0"], "cannot be opened"),
+    ],
+)
+def test_one_sentence(arguments, sentence, capsys):
+    environment = [] if "--env" in arguments else ["--env", ENV]
+    assert main(["train", *environment, "-n", "10", *arguments]) == 1
+    error = capsys.readouterr().err
+    assert re.search(sentence if "|" in sentence else re.escape(sentence), error)
+    assert error.startswith("sb3-sap: error: ")
+    assert error.count("\n") == 1
+
+
+def test_values_that_are_no_python(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "--env", ENV, "-params", "alpha:high"])
+    assert "'high' is no Python" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("- 1", "must hold environments with their settings, but holds a list"),
+        ("default: 3", "the entry 'default' must hold settings"),
+        ("default: {gamma: 0.9", "is not YAML"),
+        ("sap/LaneKepping-v0: {policy: MlpPolicy}", "did you mean 'sap/LaneKeeping-v0'?"),
+        (
+            "default: {policy: MlpPolicy, n_timesteps: 10, t_kk: 5}",
+            "the key 't_kk' is unknown to ddpg_ap: did you mean 't_k'?",
+        ),
+        ("default: {policy: MlpPolicy, n_timesteps: 10, env_wrapper: gymnasium.Nothing}", "cannot be imported"),
+    ],
+)
+def test_what_is_wrong_with_a_yaml_file(text, sentence, capsys):
+    Path("own.yml").write_text(text)
+    assert main(["train", "--env", ENV, "-n", "10", "--conf-file", "own.yml"]) == 1
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_config_of_ours_is_right(algo):
+    for name, entry in load_config(algo).items():
+        check_hyperparameters(algo, entry, name)
+
+
+# -------------------------------------------------------------------- search spaces
+
+
+@pytest.mark.parametrize("algo", GUIDED)
+def test_alpha_and_t_k_come_first_and_a_trial_converts_to_what_was_sampled(algo):
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
+    for only in (True, False):
+        trial = study.ask()
+        arguments = {"using_her_replay_buffer": False, "her_kwargs": {}, "n_timesteps": 3000, "guidance_only": only}
+        sampled = HYPERPARAMS_SAMPLER[algo](trial, 1, 1, arguments)
+        assert list(trial.params)[:2] == ["alpha", "t_k"]
+        assert (len(trial.params) == 2) == only
+        converted = HYPERPARAMS_CONVERTER[algo](trial.params)
+        sampled.pop("action_noise", None)  # rl_zoo3 makes it of these two later
+        converted = {key: value for key, value in converted.items() if key not in ("noise_type", "noise_std")}
+        assert converted == sampled
+        check_hyperparameters(algo, sampled, "the search space")
+        assert 50 <= sampled["t_k"] <= 1000
+    assert t_k_range(15_000) == (250, 5000)
+
+
+def test_a_trial_draws_the_same_in_whichever_worker():
+    def draw(number_of_trials):
+        sampler = SeededByTrial(lambda seed: optuna.samplers.RandomSampler(seed=seed), 7)
+        study = optuna.create_study(sampler=sampler)
+        return [study.ask().suggest_float("x", 0, 1) for _ in range(number_of_trials)]
+
+    assert draw(5)[:3] == draw(3)
+    assert len(set(draw(5))) == 5
+
+
+def test_a_trial_too_many_is_known_by_its_number():
+    study = optuna.create_study()
+    first, second, third = (study.ask() for _ in range(3))
+    assert [is_surplus(study, trial.number, 2) for trial in (first, second, third)] == [False, False, True]
+    study.tell(first, state=optuna.trial.TrialState.FAIL)
+    assert not is_surplus(study, third.number, 2)
+
+
+def test_passwords_are_not_shown():
+    shown = without_password("sb3-sap optimize --storage postgresql://me:secret@host:5432/db --study-name s")
+    assert shown == "sb3-sap optimize --storage postgresql://me:***@host:5432/db --study-name s"
+
+
+# -------------------------------------------------------------------- optimize, replay, retest
+
+
+def optimize(*flags):
+    command = ["optimize", "--env", ENV, "-n", "60", "--eval-episodes", "1", "--guidance-only", "--study-name", "study"]
+    return main([*command, *flags, "-params", *QUICK])
+
+
+@pytest.mark.slow
+def test_optimize_replay_retest():
+    where = ["--storage", "study.log"]
+    assert optimize(*where, "--max-total-trials", "4", "--n-startup-trials", "2", "--n-evaluations", "3") == 0
+    study = optuna.load_study(study_name="study", storage=open_storage("study.log"))
+    assert [trial.user_attrs["seed"] for trial in study.trials] == [100, 101, 102, 103]
+    assert study.user_attrs["command"].startswith("sb3-sap optimize --env sap/LaneKeeping-v0 -n 60")
+    report = Path("logs/ddpg_ap") / f"report_{FOLDER}_study"
+    assert {path.name for path in report.iterdir()} >= {"report.md", "trials.csv", "history.png", "contour.png"}
+    assert "| trial | value | alpha | t_k | seed |" in (report / "report.md").read_text()
+    # Enough were run already.
+    assert optimize(*where, "--max-total-trials", "4") == 0
+    assert len(optuna.load_study(study_name="study", storage=open_storage("study.log")).trials) == 4
+
+    # Trial 0 again, with its own seed, is trial 0 again.
+    command = ["train", "--env", ENV, "-n", "60", "--eval-freq", "20", "--eval-episodes", "1", "--trial-id", "0"]
+    assert main([*command, *where, "--study-name", "study", "-params", *QUICK]) == 0
+    [path] = Path("logs").rglob("evaluations.npz")
+    evaluations = np.load(path)
+    replayed = dict(zip(evaluations["timesteps"].tolist(), evaluations["results"].mean(axis=1).tolist(), strict=True))
+    assert replayed == study.trials[0].intermediate_values
+    assert list(replayed) == [20, 40, 60]
+
+    command = ["retest", "--env", ENV, "-n", "60", "--best", "1", "--runs", "2", *where, "--study-name", "study"]
+    command += ["--out", "retest", "--tracks", "wheel-2", "-params", *QUICK]
+    assert main(command) == 0
+    table = Path("retest/retest.md").read_text()
+    assert "| default |" in table
+    assert f"| trial {study.best_trial.number} |" in table
+    rows = Path("retest/retest.csv").read_text().splitlines()
+    assert len(rows) == 1 + 2 * 2
+    assert rows[1].startswith("default,10000,wheel-2,")
+    assert main(command) == 0  # what is there is not trained again
+    assert Path("retest/retest.csv").read_text().splitlines() == rows
+
+    assert main(["plot", "study", *where, "--study-name", "study", "--out", "drawn"]) == 0
+    assert Path("drawn/report.md").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pruner", ["median", "halving"])
+def test_nothing_is_pruned_before_every_trial_is_guided(pruner):
+    """Every trial but the first would be pruned at once, because it is worse."""
+    asked = []
+    decide = optuna.pruners.MedianPruner.prune, optuna.pruners.SuccessiveHalvingPruner.prune
+    for cls, original in zip(
+        (optuna.pruners.MedianPruner, optuna.pruners.SuccessiveHalvingPruner), decide, strict=True
+    ):
+
+        def prune(self, study, trial, original=original):
+            verdict = original(self, study, trial)
+            asked.append((trial.last_step, verdict))
+            return verdict
+
+        cls.prune = prune
+    try:
+        flags = ["--n-trials", "3", "--n-startup-trials", "0", "--n-evaluations", "12", "--pruner", pruner]
+        assert optimize("--storage", "study.log", "--no-optim-plots", *flags) == 0
+    finally:
+        optuna.pruners.MedianPruner.prune, optuna.pruners.SuccessiveHalvingPruner.prune = decide
+    assert asked
+    assert not [step for step, verdict in asked if verdict and step <= t_k_range(60)[1]]
+
+
+def test_a_study_in_memory_leaves_a_report():
+    assert optimize("-n", "20", "--n-trials", "2", "--no-optim-plots", "--optimization-log-path", "trials") == 0
+    report = Path("logs/ddpg_ap") / f"report_{FOLDER}_study"
+    assert {path.name for path in report.iterdir()} == {"report.md", "trials.csv"}
+    assert "| 0 |" in (report / "report.md").read_text()
+    assert Path("trials/trial_1/evaluations.npz").exists()
+
+
+def test_a_tuned_noise_of_none_is_loaded():
+    study = optuna.create_study(study_name="study", storage=open_storage("study.log"), direction="maximize")
+    space = {"using_her_replay_buffer": False, "her_kwargs": {}}
+    study.enqueue_trial({"noise_type": None})
+    trial = study.ask()
+    HYPERPARAMS_SAMPLER["ddpg_ap"](trial, 1, 1, space)
+    study.tell(trial, 1.0)
+    assert trial.params["noise_type"] is None
+    command = ["train", "--env", ENV, "-n", "10", "--eval-freq", "-1", "--trial-id", "0", "--storage", "study.log"]
+    assert main([*command, "--study-name", "study"]) == 0
+
+
+def test_a_study_of_something_else_is_not_continued(capsys):
+    study = optuna.create_study(study_name="study", storage=open_storage("study.log"))
+    study.set_user_attr("algo", "sac_ap")
+    assert optimize("--storage", "study.log") == 1
+    assert "is one of sac_ap on sap/LaneKeeping-v0, not of ddpg_ap" in capsys.readouterr().err
+
+
+def test_help_tells_ours_and_theirs(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["optimize", "--help"])
+    text = capsys.readouterr().out
+    assert "--guidance-only" in text
+    assert "--n-startup-trials" in text
+
+
+@pytest.mark.slow
+def test_watching_filming_and_plotting(capsys):
+    command = ["train", "--algo", "ddpg_ap", "--env", ENV, "-n", "100", "--eval-freq", "50", "--eval-episodes", "2"]
+    for _ in range(2):  # rl_zoo3 compares several runs of several episodes, never one
+        assert main([*command, "--save-freq", "50", "-tb", "boards", "-params", *QUICK]) == 0
+    run = Path("logs/ddpg_ap") / f"{FOLDER}_1"
+    assert list(Path("boards").rglob("events.*"))
+    for which in (
+        ["--load-checkpoint", "50"],
+        ["--load-last-checkpoint"],
+        ["--n-envs", "2", "--reward-log", "rewards"],
+    ):
+        assert main(["enjoy", "--env", ENV, "--no-render", "-n", "60", *which]) == 0
+    assert main(["record-video", "--env", ENV, "-n", "20", "--exp-id", "1", "--load-best"]) == 0
+    [film] = (run / "videos").glob("*.mp4")
+    assert film.stat().st_size > 1_000
+    assert (
+        main(["plot", "train", "-a", "ddpg_ap", "-e", ENV, "-f", "logs", "-w", "2", "--save-figures", "figures"]) == 0
+    )
+    command = ["plot", "all", "-a", "ddpg_ap", "-e", FOLDER, "-f", "logs", "--no-million", "-o", "post"]
+    assert main([*command, "--save-figures", "figures"]) == 0
+    assert main(["plot", "file", "-i", "post", "--no-million", "--save-figures", "figures"]) == 0
+    assert {path.name for path in Path("figures").iterdir()} >= {"train_1.png", "all_1.png"}
+    capsys.readouterr()
+    assert main(["enjoy", "--env", ENV, "--no-render", "--exp-id", "7"]) == 1
+    assert "was not found" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("simulator", ["highway", "torcs"])
+def test_a_study_maximises_the_score_of_laps(simulator):
+    """The value of a trial is the mean of what `sb3-sap evaluate` says of the model that it saved."""
+    if simulator == "torcs":
+        try:
+            gym.make(ENVIRONMENTS["torcs"])
+        except (OSError, RuntimeError) as error:
+            if os.environ.get("SB3_SAP_REQUIRE_TORCS"):
+                raise
+            pytest.skip(str(error))
+    tracks = ["random:3", "random:4"] if simulator == "highway" else ["g-track-1", "e-track-1"]
+    command = ["optimize", "--env", ENVIRONMENTS[simulator], "--validation-tracks", *tracks, "-n", "100"]
+    command += [
+        "--n-trials",
+        "1",
+        "--study-name",
+        "laps",
+        "--storage",
+        "study.log",
+        "--optimization-log-path",
+        "trials",
+    ]
+    assert main([*command, "--guidance-only", "--no-optim-plots", "-params", *QUICK]) == 0
+    [trial] = optuna.load_study(study_name="laps", storage=open_storage("study.log")).trials
+    policy = load_policy(Path("trials/trial_0/best_model.zip"))
+    scores = [drive_lap(policy, track, simulator).score for track in tracks]
+    assert trial.value == pytest.approx(np.mean(scores), abs=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if name != "ddpg_ap"])
+def test_every_algorithm_trains_and_tunes(algo):
+    """The whole search space of each, and what it leaves is watched."""
+    small = ["policy_kwargs:dict(net_arch=[8])", "batch_size:8", "buffer_size:500", "learning_starts:5"]
+    command = ["train", "--algo", algo, "--env", ENV, "-n", "30", "--eval-freq", "-1", "-params", *small]
+    assert main(command) == 0
+    assert main(["enjoy", "--algo", algo, "--env", ENV, "--no-render", "-n", "5"]) == 0
+    command = ["optimize", "--algo", algo, "--env", ENV, "-n", "20", "--eval-episodes", "1", "--n-trials", "1"]
+    assert main([*command, "--study-name", "whole", "--no-optim-plots"]) == 0
+    assert "| 0 |" in (Path("logs") / algo / f"report_{FOLDER}_whole" / "report.md").read_text()
+
+
+@pytest.mark.parametrize("arguments", [["plot"], ["plot", "nothing"]])
+def test_plot_says_what_it_draws(arguments, capsys):
+    assert main(arguments) == 1
+    assert "'study'" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.files import atomic_path
 
 #: Training steps after which the actor drives a lap of each test track; and at the end of the training.
-CHECKPOINTS = (250, 500, 750, 1000, 1250, 1500, 2000, 2500, 3000, 4000, 5000, 7500, 10000, 12500, 15000)
+CHECKPOINTS = (100, 150, 200, 250, 350, 500, 750, 1000, 1500, 2000, 3000, 5000, 7500, 10000, 12500, 15000)
 #: Options of the environment that belong to the task, so that the laps are driven with them too.
 TASK_OPTIONS = ("speed", "control_step", "car")
 

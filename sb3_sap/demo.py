@@ -37,7 +37,7 @@ class Run:
     """What to train, where, and where to leave the results."""
 
     algo: str = "ddpg_ap"
-    preset: str = "default"
+    preset: str = "fast"
     steps: int = 3_000
     seed: int = 0
     track: str = "wheel-2"

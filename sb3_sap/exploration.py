@@ -121,7 +121,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
                 self.predictor,
                 cast(ReplayBuffer, self.replay_buffer),
                 coef,
-                batch_size,
+                self.predictor.batch_size,  # as many states as one gradient step of E sees
                 self._vec_normalize_env,
             )
             self.logger.record_mean("sap/actor_loss", loss)

@@ -55,7 +55,9 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--algo", choices=list(ALGORITHMS), default=default.algo, help="the algorithm")
-    command.add_argument("--preset", default=default.preset, help="named settings of zoo_configs")
+    command.add_argument(
+        "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
+    )
     command.add_argument("--steps", type=_positive, default=default.steps, help="training steps")
     command.add_argument("--seed", type=int, default=default.seed, help="seed of everything random")
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")

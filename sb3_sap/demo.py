@@ -23,7 +23,7 @@ from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
 from sb3_sap.envs import TRACKS
 from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive, drive_lap, write_results
 from sb3_sap.files import atomic_path
-from sb3_sap.presets import preset
+from sb3_sap.presets import preset, preset_names
 
 #: km/h, the default speed of the task.
 SPEED = 50.0
@@ -37,7 +37,7 @@ class Run:
     """What to train, where, and where to leave the results."""
 
     algo: str = "ddpg_ap"
-    preset: str = "fast"
+    preset: str | None = None  # "fast" where there is one, else "default"
     steps: int = 3_000
     seed: int = 0
     track: str = "wheel-2"
@@ -93,13 +93,14 @@ def ctrl_c_stops(log: TrainingLog) -> Iterator[None]:
 def demo(run: Run, console: Console) -> list[LapResult]:
     """Trains, drives the test tracks and leaves model, tables and pictures in ``run.out``."""
     env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
-    settings = preset(run.preset, run.algo, run.steps)
+    name = run.preset or ("fast" if "fast" in preset_names(run.algo) else "default")
+    settings = preset(name, run.algo, run.steps)
     model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
     log = TrainingLog()
     try:
         with ctrl_c_stops(log):
             console.print(
-                f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {run.preset!r})"
+                f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {name!r})"
             )
             model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
     finally:

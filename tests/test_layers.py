@@ -16,7 +16,7 @@ FLOORS = (
     {"demo"},
     {"zoo", "benchmark", "evaluation", "plots", "presets", "statistics"},
     {"algorithms"},
-    {"exploration"},
+    {"exploration", "check"},
     {"learning"},
     {
         "constraints",
@@ -29,7 +29,7 @@ FLOORS = (
         "candidates",
         "prediction",
     },
-    {"permissibility", "generators", "files", "errors"},
+    {"permissibility", "generators", "files", "errors", "advice"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}
 

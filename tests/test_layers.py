@@ -14,7 +14,7 @@ PACKAGE = Path(sb3_sap.__file__).parent
 FLOORS = (
     {"cli"},
     {"demo"},
-    {"zoo", "benchmark", "evaluation", "plots", "presets", "statistics"},
+    {"zoo", "benchmark", "evaluation", "plots", "beliefs", "presets", "statistics"},
     {"algorithms"},
     {"exploration", "check"},
     {"learning"},
@@ -29,7 +29,7 @@ FLOORS = (
         "candidates",
         "prediction",
     },
-    {"permissibility", "generators", "files", "errors", "advice"},
+    {"permissibility", "generators", "files", "errors", "advice", "tensorboard"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}
 

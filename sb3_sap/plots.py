@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.monitor import Monitor, load_results
 
 from sb3_sap.beliefs import plot_permissibility, predictor_beliefs
 from sb3_sap.files import atomic_path
@@ -31,8 +31,8 @@ def save(figure: Figure, path: Path) -> None:
 def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window: int = 10) -> Figure:
     """Return per episode against training steps, of runs in environments wrapped in SB3's ``Monitor``.
 
-    :param runs: for each name in the legend the folder of a run's ``monitor.csv``, or those of runs with several
-        seeds: then their mean is drawn, and each of them faintly
+    :param runs: for each name in the legend what ``Monitor`` was given as its file name, or a folder of such files; or
+        several of them, of runs with different seeds: then their mean is drawn, and each of them faintly
     :param window: episodes of the moving average
     """
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -41,7 +41,7 @@ def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window:
         colour = f"C{number}"
         curves = []
         for folder in [folders] if isinstance(folders, (str, Path)) else folders:
-            episodes = load_results(str(folder))
+            episodes = _episodes(Path(folder))
             steps = episodes["l"].cumsum().to_numpy()
             curves.append((steps, episodes["r"].rolling(window, min_periods=1).mean().to_numpy()))
         if len(curves) > 1:
@@ -52,9 +52,19 @@ def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window:
         mean = np.mean([np.interp(grid, steps, average) for steps, average in curves], axis=0)
         axis.plot(grid, mean, color=colour, linewidth=2, label=name)
     axis.set(xlabel="training step", ylabel=f"return, average of {window} episodes")
-    axis.legend(loc="lower right")
+    axis.legend()
     axis.grid(alpha=0.3)
     return figure
+
+
+def _episodes(path: Path) -> pd.DataFrame:
+    if path.is_dir():
+        return load_results(str(path))
+    # Monitor appends this where it is missing.
+    file = path if path.name.endswith(Monitor.EXT) else path.with_name(f"{path.name}.{Monitor.EXT}")
+    if not file.is_file():
+        raise FileNotFoundError(f"There is neither a folder {path} nor a file {file}, as SB3's Monitor writes them.")
+    return pd.read_csv(file, skiprows=1)
 
 
 def learning_curve(training: pd.DataFrame, title: str, t_k: int | None = None) -> Figure:

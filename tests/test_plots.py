@@ -126,12 +126,18 @@ def test_return_curves(tmp_path):
         rows = "".join(f"{r},10,{10 * i}\n" for i, r in enumerate(returns))
         (tmp_path / name).mkdir()
         (tmp_path / name / "monitor.csv").write_text('#{"t_start": 0, "env_id": "x"}\nr,l,t\n' + rows)
-    axis = return_curves({"both": [tmp_path / "a", tmp_path / "b"], "one": tmp_path / "a"}, window=1).axes[0]
+    (tmp_path / "c.monitor.csv").write_text((tmp_path / "a" / "monitor.csv").read_text())  # Monitor(env, "c")
+    axis = return_curves({"both": [tmp_path / "a", tmp_path / "b"], "one": tmp_path / "c"}, window=1).axes[0]
     faint, _, mean, one = axis.lines
     assert faint.get_xydata().tolist() == [[10, 1], [20, 3]]
     assert mean.get_ydata()[[0, -1]].tolist() == [3, 5]
     assert one.get_ydata()[[0, -1]].tolist() == [1, 3]
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["both", "one"]
+
+
+def test_missing_monitor_files_are_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="as SB3's Monitor writes"):
+        return_curves({"a": tmp_path / "nothing"})
 
 
 def red_green(pixel):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +50,13 @@ class Run:
     simulator: str = "highway"
     out: Path = field(default_factory=lambda: Path("demo_output"))
     animation: bool = True
+
+    @property
+    def command(self) -> str:
+        """The command that does the same again."""
+        names = ("algo", "preset", "steps", "seed", "track", "simulator")
+        words = [word for name in names for word in (f"--{name}", str(getattr(self, name)))]
+        return shlex.join(["sb3-sap", "demo", *words])
 
 
 class TrainingLog(BaseCallback):
@@ -110,6 +119,9 @@ def demo(run: Run, console: Console) -> list[LapResult]:
         # Ctrl-C included: what was learned so far stays.
         with atomic_path(run.out / "model.zip") as temporary:
             model.save(temporary)
+        with atomic_path(run.out / "run.json") as temporary:
+            described = {**asdict(run), "out": str(run.out), "command": run.command}
+            temporary.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
         training = pd.DataFrame(log.rows)
         with atomic_path(run.out / "training.csv") as temporary:
             training.to_csv(temporary, index=False)

@@ -42,6 +42,8 @@ def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window:
         curves = []
         for folder in [folders] if isinstance(folders, (str, Path)) else folders:
             episodes = _episodes(Path(folder))
+            if episodes.empty:
+                raise ValueError(f"The run {folder} has not finished an episode yet: there is no return to draw.")
             steps = episodes["l"].cumsum().to_numpy()
             curves.append((steps, episodes["r"].rolling(window, min_periods=1).mean().to_numpy()))
         if len(curves) > 1:

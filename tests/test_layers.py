@@ -13,7 +13,7 @@ PACKAGE = Path(sb3_sap.__file__).parent
 # From the top. A room may use those below it and its neighbours on the same floor.
 FLOORS = (
     {"cli"},
-    {"demo"},
+    {"demo", "hub"},
     {"zoo", "benchmark", "evaluation", "plots", "beliefs", "presets", "statistics"},
     {"algorithms"},
     {"exploration", "check"},

@@ -75,7 +75,8 @@ def test_the_readme_has_its_three_snippets():
 COMMANDS = [
     (name, line.split("  #")[0].strip())
     for name, text in TEXTS.items()
-    for block in re.findall(r"^ *```(?:bash)?\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
+    for language, block in re.findall(r"^ *```(.*?)\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
+    if language in ("", "bash")
     for line in block.replace("\\\n", "").splitlines()
     if line.strip().startswith("sb3-sap ")
 ]

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 
 from sb3_sap.buffers import KnowledgeMixin
 from sb3_sap.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
+from sb3_sap.tensorboard import add_layout
 
 if TYPE_CHECKING:
     from sb3_sap.learning import LearnedPermissibilityMixin
@@ -37,6 +38,9 @@ class PermissibilityCallback(BaseCallback):
     def knowledge(self) -> KnowledgeBuffer:
         """K, which lives in the model's replay buffer."""
         return cast(KnowledgeMixin, self.model.replay_buffer).knowledge
+
+    def _on_training_start(self) -> None:
+        add_layout(self.logger)
 
     def _on_rollout_start(self) -> None:
         self._start = self.model.num_timesteps

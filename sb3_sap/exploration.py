@@ -35,8 +35,9 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         ``learning_starts``, whose uniform random steps count inside it
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
-    :param actor_permissibility_coef: β of the permissible actor loss, a number, an SB3 schedule or "lin_β"; 0 is the paper's
-        method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for ``alpha``
+    :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
+        paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for
+        ``alpha``
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.

@@ -5,6 +5,7 @@ The "tracks" of such a cell are the seeds of its evaluation episodes, the score 
 
 from __future__ import annotations
 
+import copy
 import importlib
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.errors import nearest
-from sb3_sap.permissibility import APFunction, resolve
+from sb3_sap.permissibility import APFunction, ask, resolve
 from sb3_sap.presets import algorithms, load_config, settings_in
 
 #: Seeds of the evaluation episodes, the same for every run.
@@ -96,34 +97,65 @@ def make_env(env_id: str, options: dict[str, Any]) -> gym.Env[Any, Any]:
 
 def evaluation(env_id: str, algo: str, options: dict[str, Any], seeds: list[str]) -> Callable[[Any], list[list[Any]]]:
     """A function that evaluates a policy deterministically: rows that follow the checkpoint in ``RETURN_COLUMNS``."""
-    env = make_env(env_id, options)
     name = entry(algo, env_id).get("ap_function")
     ap_function = None if name is None else resolve(name, "ap_function")
-    return lambda policy: [[seed, *episode(policy, env, int(seed), ap_function)] for seed in seeds]
+    envs = [make_env(env_id, options) for _ in seeds]
+
+    def evaluate(policy: Any) -> list[list[Any]]:
+        episodes = [Episode(env, int(seed)) for env, seed in zip(envs, seeds, strict=True)]
+        # Side by side: to ask a small network once for all costs as much as for one.
+        while running := [episode for episode in episodes if not episode.done]:
+            actions, _ = policy.predict(_stacked([episode.obs for episode in running]), deterministic=True)
+            for episode, action in zip(running, actions, strict=True):
+                episode.step(action)
+        return [[seed, *episode.row(ap_function)] for seed, episode in zip(seeds, episodes, strict=True)]
+
+    return evaluate
 
 
-def episode(policy: Any, env: gym.Env[Any, Any], seed: int, ap_function: APFunction | None) -> list[Any]:
-    """Runs one episode deterministically.
+class Episode:
+    """An episode that runs, and what is told of it when it has ended.
 
-    :param ap_function: labels the policy's own actions; None: labels come from ``info``
-    :return: success, if the environment tells; share of permissible actions; return, twice; steps
+    :param env: the environment, which is reset
+    :param seed: of this episode
     """
-    obs, _ = env.reset(seed=seed)
-    total, labels, done = 0.0, [], False
-    info: dict[str, Any] = {}
-    while not done:
-        action, _ = policy.predict(obs, deterministic=True)
-        before = {key: np.copy(part) for key, part in obs.items()} if isinstance(obs, dict) else np.copy(obs)
-        obs, reward, terminated, truncated, info = env.step(action)
-        total, done = total + float(reward), terminated or truncated
-        if ap_function is None:
-            labels.append(info["permissible"])
-        else:
-            labels.append(ap_function(_batch(before), np.asarray(action)[None], _batch(obs))[0])
-    success = info.get("is_success")
-    total = round(total, 4)
-    return [None if success is None else bool(success), round(float(np.mean(labels)), 4), total, total, len(labels)]
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int):
+        self.env = env
+        self.obs = copy.deepcopy(env.reset(seed=seed)[0])
+        self.done = False
+        self._total = 0.0
+        self._info: dict[str, Any] = {}
+        self._observations = [self.obs]
+        self._actions: list[Any] = []
+        self._labels: list[bool | None] = []
+
+    def step(self, action: Any) -> None:
+        """Goes on by one step."""
+        obs, reward, terminated, truncated, self._info = self.env.step(action)
+        self.obs = copy.deepcopy(obs)  # an environment may reuse its array
+        self.done = terminated or truncated
+        self._total += float(reward)
+        self._observations.append(self.obs)
+        self._actions.append(action)
+        self._labels.append(self._info.get("permissible"))
+
+    def row(self, ap_function: APFunction | None) -> list[Any]:
+        """Success, if the environment tells; share of permissible actions; return, twice; steps.
+
+        :param ap_function: labels the actions; None: the environment did
+        """
+        labels: Any = self._labels
+        if ap_function is not None:
+            before, after = _stacked(self._observations[:-1]), _stacked(self._observations[1:])
+            labels = ask(ap_function, "ap_function", before, np.stack(self._actions), after)
+        success, total = self._info.get("is_success"), round(self._total, 4)
+        permissible = round(float(np.mean(labels)), 4)
+        return [None if success is None else bool(success), permissible, total, total, len(labels)]
 
 
-def _batch(obs: Any) -> Any:
-    return {key: part[None] for key, part in obs.items()} if isinstance(obs, dict) else obs[None]
+def _stacked(observations: list[Any]) -> Any:
+    first = observations[0]
+    if isinstance(first, dict):
+        return {key: np.stack([obs[key] for obs in observations]) for key in first}
+    return np.stack(observations)

@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Networks this small train no faster on two threads; two processes side by side do.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-all torcs lint coverage clean
+.PHONY: demo test test-all torcs lint docs coverage clean
 
 demo: .venv/.installed
 	$(BIN)/sb3-sap demo
@@ -24,6 +24,10 @@ lint: .venv/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The site, in docs/_build.
+docs: .venv/.installed
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build
+
 coverage: .venv/.installed
 	$(BIN)/pytest -q -n 2 --cov --cov-report=term-missing:skip-covered
 
@@ -33,4 +37,4 @@ coverage: .venv/.installed
 	touch $@
 
 clean:
-	rm -rf .venv build dist *.egg-info
+	rm -rf .venv build dist docs/_build *.egg-info

@@ -22,6 +22,7 @@ from sb3_sap.buffers import (
     PermissibilityReplayBuffer,
 )
 from sb3_sap.callbacks import PermissibilityCallback
+from sb3_sap.check import PermissibilityReport, check_permissibility
 from sb3_sap.constraints import ConstrainedExplorationMixin
 from sb3_sap.exploration import ActionPermissibilityMixin
 from sb3_sap.knowledge import KnowledgeBuffer
@@ -56,5 +57,7 @@ __all__ = [
     "PermissibilityNStepReplayBuffer",
     "PermissibilityPredictor",
     "PermissibilityReplayBuffer",
+    "PermissibilityReport",
+    "check_permissibility",
     "envs",
 ]

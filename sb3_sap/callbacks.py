@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 
 from sb3_sap.buffers import KnowledgeMixin
 from sb3_sap.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
+from sb3_sap.tensorboard import add_layout
 
 if TYPE_CHECKING:
     from sb3_sap.learning import LearnedPermissibilityMixin
@@ -19,7 +20,7 @@ CONSTANT_LABELS_WARNING = 1_000
 
 
 class PermissibilityCallback(BaseCallback):
-    """Fits E, at the end of each rollout, once for every ``permissibility_freq`` vectorised steps, then validates it.
+    """Fits E at the end of each rollout, once for every vectorised step unless ``refit_growth`` skips it; validates it.
 
     A guided model installs one by itself. To change how E is trained, override :meth:`fit` or :meth:`validate` and
     pass an instance to ``learn(callback=...)``: it takes the place of the default.
@@ -38,6 +39,9 @@ class PermissibilityCallback(BaseCallback):
         """K, which lives in the model's replay buffer."""
         return cast(KnowledgeMixin, self.model.replay_buffer).knowledge
 
+    def _on_training_start(self) -> None:
+        add_layout(self.logger)
+
     def _on_rollout_start(self) -> None:
         self._start = self.model.num_timesteps
         self._seen = tuple(self.knowledge.seen)
@@ -50,7 +54,7 @@ class PermissibilityCallback(BaseCallback):
         knowledge = self.knowledge
         new = np.subtract(knowledge.seen, self._seen)
         self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
-        due = self._fits_due()
+        due = self.model.refits_due(self._start // self.model.n_envs, self.model.num_timesteps // self.model.n_envs)
         if min(knowledge.counts("train")) >= self.model.min_per_class:
             for _ in range(due):
                 self.fit()
@@ -58,13 +62,6 @@ class PermissibilityCallback(BaseCallback):
             self._warn_of_constant_labels(knowledge.seen)
         if due > 0 and self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
             self.validate()
-
-    def _fits_due(self) -> int:
-        model = self.model
-        before, now = (
-            steps // model.n_envs // model.permissibility_freq for steps in (self._start, model.num_timesteps)
-        )
-        return now - before
 
     def fit(self) -> None:
         """One pass over a balanced D_E of ``dataset_size`` examples."""

@@ -14,6 +14,7 @@ from sb3_sap.benchmark.cli import add_benchmark
 from sb3_sap.envs.torcs.cli import add_torcs
 from sb3_sap.errors import run_command
 from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.hub import add_push_to_hub
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -36,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     add_benchmark(commands)
     add_torcs(commands)
+    add_push_to_hub(commands)
     for name, summary in zoo.COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     return root
@@ -50,12 +52,14 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "demo",
         help="train a car to keep its lane, then drive the unseen tracks",
         description="Trains on one track, drives one lap of each of the paper's four test tracks with the actor alone, "
-        "prints a table, and leaves model.zip, training.csv, evaluation.json, learning_curve.png, predictor.png and "
-        "lap.gif in the output folder.",
+        "prints a table, and leaves model.zip, run.json, training.csv, evaluation.json, learning_curve.png, "
+        "predictor.png and lap.gif in the output folder.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--algo", choices=list(ALGORITHMS), default=default.algo, help="the algorithm")
-    command.add_argument("--preset", default=default.preset, help="named settings of zoo_configs")
+    command.add_argument(
+        "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
+    )
     command.add_argument("--steps", type=_positive, default=default.steps, help="training steps")
     command.add_argument("--seed", type=int, default=default.seed, help="seed of everything random")
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")

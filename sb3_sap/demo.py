@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
 from PIL import Image
 from rich.console import Console
@@ -19,17 +22,20 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sap import plots
 from sb3_sap.algorithms import ALGORITHMS
+from sb3_sap.beliefs import permissible_probability
 from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
-from sb3_sap.envs import TRACKS
-from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive, drive_lap, write_results
+from sb3_sap.envs import TRACKS, CarState
+from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive_lap, write_results
 from sb3_sap.files import atomic_path
-from sb3_sap.presets import preset
+from sb3_sap.presets import preset, preset_names
 
 #: km/h, the default speed of the task.
 SPEED = 50.0
 #: Control steps shown in the animation (30 s of driving), and pictures per second: twice real time.
 ANIMATION_STEPS = 150
 ANIMATION_FPS = 10
+#: Steering angles of the fan that shows E's verdict.
+FAN_ANGLES = 31
 
 
 @dataclass
@@ -37,13 +43,20 @@ class Run:
     """What to train, where, and where to leave the results."""
 
     algo: str = "ddpg_ap"
-    preset: str = "default"
+    preset: str | None = None  # "fast" where there is one, else "default"
     steps: int = 3_000
     seed: int = 0
     track: str = "wheel-2"
     simulator: str = "highway"
     out: Path = field(default_factory=lambda: Path("demo_output"))
     animation: bool = True
+
+    @property
+    def command(self) -> str:
+        """The command that does the same again."""
+        names = ("algo", "preset", "steps", "seed", "track", "simulator")
+        words = [word for name in names for word in (f"--{name}", str(getattr(self, name)))]
+        return shlex.join(["sb3-sap", "demo", *words])
 
 
 class TrainingLog(BaseCallback):
@@ -93,19 +106,23 @@ def ctrl_c_stops(log: TrainingLog) -> Iterator[None]:
 def demo(run: Run, console: Console) -> list[LapResult]:
     """Trains, drives the test tracks and leaves model, tables and pictures in ``run.out``."""
     env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
-    settings = preset(run.preset, run.algo, run.steps)
+    name = run.preset or ("fast" if "fast" in preset_names(run.algo) else "default")
+    settings = preset(name, run.algo, run.steps)
     model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
     log = TrainingLog()
     try:
         with ctrl_c_stops(log):
             console.print(
-                f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {run.preset!r})"
+                f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {name!r})"
             )
             model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
     finally:
         # Ctrl-C included: what was learned so far stays.
         with atomic_path(run.out / "model.zip") as temporary:
             model.save(temporary)
+        with atomic_path(run.out / "run.json") as temporary:
+            described = {**asdict(run), "out": str(run.out), "command": run.command}
+            temporary.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
         training = pd.DataFrame(log.rows)
         with atomic_path(run.out / "training.csv") as temporary:
             training.to_csv(temporary, index=False)
@@ -164,16 +181,29 @@ def draw(run: Run, model: Any, training: pd.DataFrame) -> None:
 
 
 def animate(policy: Any, run: Run, console: Console, track: str = "g-track-3") -> None:
-    """Writes a short animation of the policy on a track that it has never seen."""
-    env = gym.make(ENVIRONMENTS[run.simulator], track=track, speed=SPEED, render_mode="rgb_array")
-    frames = []
+    """Writes a short animation of the policy on a track that it has never seen.
+
+    Each picture shows a state, what the actor is about to do there, and E's verdict on every steering angle.
+    """
+    from sb3_sap.envs.viewer import Viewer
+
+    env = gym.make(ENVIRONMENTS[run.simulator], track=track, speed=SPEED)
+    viewer = Viewer(env.unwrapped.simulator.track)  # type: ignore[attr-defined]
+    guided = getattr(policy, "predictor", None) is not None and policy.predictor.fitted
+    steering = np.linspace(-1, 1, FAN_ANGLES)[:, None]
+    frames: list[Image.Image] = []
+    obs, info = env.reset(seed=0)
+    done = False
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("animation", total=ANIMATION_STEPS)
-        for _ in drive(policy, env):
-            frames.append(Image.fromarray(env.render()).quantize(64))  # type: ignore[arg-type]
+        while not done and len(frames) < ANIMATION_STEPS:
+            action, _ = policy.predict(obs, deterministic=True)
+            fan = permissible_probability(policy, obs[None], steering)[0] if guided else None
+            state = CarState(*(info[name] for name in CarState._fields))
+            frames.append(Image.fromarray(viewer.draw(state, float(action[0]), fan)).quantize(64))
+            obs, _, terminated, truncated, info = env.step(action)
+            done = terminated or truncated
             progress.advance(task)
-            if len(frames) == ANIMATION_STEPS:
-                break
     env.close()
     with atomic_path(run.out / "lap.gif") as temporary:
         frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=1000 // ANIMATION_FPS, loop=0)

@@ -117,13 +117,13 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
         if coef == 0 or not self.predictor_suffices:
             return
-        for _ in range(self._n_updates // self.permissibility_freq - before // self.permissibility_freq):
+        for _ in range(self.refits_due(before, self._n_updates)):
             loss = permissible_actor_step(
                 self.actor,
                 self.predictor,
                 cast(ReplayBuffer, self.replay_buffer),
                 coef,
-                batch_size,
+                self.predictor.batch_size,  # as many states as one gradient step of E sees
                 self._vec_normalize_env,
             )
             self.logger.record_mean("sap/actor_loss", loss)

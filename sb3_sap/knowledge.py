@@ -140,14 +140,21 @@ class KnowledgeBuffer:
             self.actions[slot] = actions[i]
             self.seen[int(label)] += 1
 
-    def sample(self, n: int, part: Part = "train", env: VecNormalize | None = None) -> LabelledActions:
+    def sample(
+        self, n: int, part: Part = "train", env: VecNormalize | None = None, balanced: bool = True
+    ) -> LabelledActions:
         """Draws D_E, balanced and stratified: n // 2 tuples of each class, with replacement, in random order.
 
         :param env: normalises the observations, if given
+        :param balanced: False draws every tuple with the same probability
         """
-        chosen = [self.rng.choice(self.parts[part].slots(label), n // 2) for label in CLASSES]
+        n_permissible = n // 2
+        if not balanced:
+            n_permissible = int(self.rng.binomial(2 * (n // 2), self.counts(part)[PERMISSIBLE] / len(self.parts[part])))
+        sizes = (2 * (n // 2) - n_permissible, n_permissible)
+        chosen = [self.rng.choice(self.parts[part].slots(label), sizes[label]) for label in CLASSES]
         slots = self._offset[part] + np.concatenate(chosen)
-        labels = np.repeat(np.array(CLASSES, dtype=np.float32), n // 2)
+        labels = np.repeat(np.array(CLASSES, dtype=np.float32), sizes)
         order = self.rng.permutation(len(slots))
         slots, labels = slots[order], labels[order]
         rows = {key: store[slots] for key, store in self.observations.items()}

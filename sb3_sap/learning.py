@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,8 @@ class LearnedPermissibilityMixin(SettingsMixin):
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
     :param min_per_class: examples of each class that K must hold before E is fitted
-    :param permissibility_freq: once in so many steps E is fitted and validated, and teaches the actor where it does;
-        1 is the paper's
+    :param refit_growth: E is fitted and validated, and teaches the actor where it does, each time that the steps taken
+        have grown by this share; 0, the paper's, at every step
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
     """
 
@@ -51,7 +52,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
         dataset_size: int = 512,
         validation_size: int = 200,
         min_per_class: int = 20,
-        permissibility_freq: int = 1,
+        refit_growth: float = 0.0,
         predictor_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -61,14 +62,16 @@ class LearnedPermissibilityMixin(SettingsMixin):
         self.dataset_size = dataset_size
         self.validation_size = validation_size
         self.min_per_class = min_per_class
-        self.permissibility_freq = permissibility_freq
+        self.refit_growth = refit_growth
         self.predictor_kwargs = predictor_kwargs
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        check_at_least(self, min_per_class=1, dataset_size=2, validation_size=2, permissibility_freq=1)
+        check_at_least(self, min_per_class=1, dataset_size=2, validation_size=2)
+        if not 0 <= self.refit_growth < 1:
+            raise ValueError(f"`refit_growth` is a share from 0 to below 1, but is {self.refit_growth!r}.")
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
@@ -138,6 +141,20 @@ class LearnedPermissibilityMixin(SettingsMixin):
                 callback = ConvertCallback(callback)
             callback = [PermissibilityCallback(), *(callback if isinstance(callback, list) else [callback])]
         return super()._init_callback(callback, progress_bar)
+
+    def refits_due(self, before: int, now: int) -> int:
+        """How many fits belong to the steps after ``before``, up to ``now``.
+
+        Their number grows with the steps at first, and with the logarithm once ``refit_growth`` of the steps is more
+        than one: what few new examples can change in E is soon little, but the cost of a fit stays.
+        """
+
+        def fits(steps: int) -> int:
+            if self.refit_growth * steps <= 1:
+                return steps
+            return int((1 + math.log(self.refit_growth * steps)) / self.refit_growth)
+
+        return fits(now) - fits(before)
 
     @property
     def predictor_suffices(self) -> bool:

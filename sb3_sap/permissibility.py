@@ -50,18 +50,18 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         obs, info = self.env.reset(**kwargs)
-        self._obs = _copy(obs)
+        self._obs = copy_observation(obs)
         return obs, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         next_obs, reward, terminated, truncated, info = self.env.step(action)
         info = {**info, "permissible": self.permissible(self._obs, action, next_obs)}
-        self._obs = _copy(next_obs)
+        self._obs = copy_observation(next_obs)
         return next_obs, reward, terminated, truncated, info
 
 
-def _copy(obs: Any) -> Any:
-    # An environment may reuse its observation array; the label needs the one from before the step.
+def copy_observation(obs: Any) -> Any:
+    """A copy of one observation: an environment may reuse its array, and a label needs the one before the step."""
     return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
 
 

@@ -1,22 +1,24 @@
-"""Pictures of a training run and of what the predictor believes."""
+"""Pictures of training runs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch as th
 from matplotlib.figure import Figure
+from stable_baselines3.common.monitor import Monitor, load_results
 
-from sb3_sap.envs.lane_keeping import OBSERVATION_SCALE
+from sb3_sap.beliefs import plot_permissibility, predictor_beliefs
 from sb3_sap.files import atomic_path
+
+__all__ = ["learning_curve", "plot_permissibility", "predictor_beliefs", "return_curves", "save"]
 
 #: Steps of the moving average of Fig. 4(a).
 WINDOW = 100
-#: Points along each axis of the predictor's picture.
-RESOLUTION = 121
+#: Points of a mean over several runs.
+POINTS = 200
 DPI = 120
 
 
@@ -24,6 +26,47 @@ def save(figure: Figure, path: Path) -> None:
     """Writes a figure in the format of the path's suffix."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=DPI)
+
+
+def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window: int = 10) -> Figure:
+    """Return per episode against training steps, of runs in environments wrapped in SB3's ``Monitor``.
+
+    :param runs: for each name in the legend what ``Monitor`` was given as its file name, or a folder of such files; or
+        several of them, of runs with different seeds: then their mean is drawn, and each of them faintly
+    :param window: episodes of the moving average
+    """
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
+    for number, (name, folders) in enumerate(runs.items()):
+        colour = f"C{number}"
+        curves = []
+        for folder in [folders] if isinstance(folders, (str, Path)) else folders:
+            episodes = _episodes(Path(folder))
+            if episodes.empty:
+                raise ValueError(f"The run {folder} has not finished an episode yet: there is no return to draw.")
+            steps = episodes["l"].cumsum().to_numpy()
+            curves.append((steps, episodes["r"].rolling(window, min_periods=1).mean().to_numpy()))
+        if len(curves) > 1:
+            for steps, average in curves:
+                axis.plot(steps, average, color=colour, alpha=0.3, linewidth=0.8)
+        # Over the steps that every run has behind it.
+        grid = np.linspace(max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves), POINTS)
+        mean = np.mean([np.interp(grid, steps, average) for steps, average in curves], axis=0)
+        axis.plot(grid, mean, color=colour, linewidth=2, label=name)
+    axis.set(xlabel="training step", ylabel=f"return, average of {window} episodes")
+    axis.legend()
+    axis.grid(alpha=0.3)
+    return figure
+
+
+def _episodes(path: Path) -> pd.DataFrame:
+    if path.is_dir():
+        return load_results(str(path))
+    # Monitor appends this where it is missing.
+    file = path if path.name.endswith(Monitor.EXT) else path.with_name(f"{path.name}.{Monitor.EXT}")
+    if not file.is_file():
+        raise FileNotFoundError(f"There is neither a folder {path} nor a file {file}, as SB3's Monitor writes them.")
+    return pd.read_csv(file, skiprows=1)
 
 
 def learning_curve(training: pd.DataFrame, title: str, t_k: int | None = None) -> Figure:
@@ -56,45 +99,3 @@ def learning_curve(training: pd.DataFrame, title: str, t_k: int | None = None) -
         axis.grid(alpha=0.3)
     axes[-1].set_xlabel("training step")
     return figure
-
-
-def predictor_beliefs(model: Any, speed: float) -> Figure:
-    """The predictor's probability that a steering action is permissible, over trackPos and over angle.
-
-    :param model: a guided lane-keeping model
-    :param speed: km/h
-    """
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
-    steering = np.linspace(-1, 1, RESOLUTION)
-    # On the axis itself Eq. (6) forbids almost everything, so the angle is swept beside it.
-    beside = 0.3
-    sweeps = (
-        (1, 1.0, 0.0, "trackPos (+1 left edge), car aligned with the road"),
-        (0, 0.5, beside, f"angle [rad] (+ points right), car at trackPos {beside}"),
-    )
-    for axis, (variable, limit, track_pos, label) in zip(axes, sweeps, strict=True):
-        values = np.linspace(-limit, limit, RESOLUTION)
-        raw = np.zeros((RESOLUTION, 5))
-        raw[:, 1], raw[:, 2] = track_pos, speed
-        raw[:, variable] = values
-        obs = (raw / OBSERVATION_SCALE).astype(np.float32)
-        image = axis.pcolormesh(
-            values, steering, permissible_probability(model, obs, steering).T, cmap="RdYlGn", vmin=0, vmax=1
-        )
-        axis.plot(values, model.predict(obs, deterministic=True)[0][:, 0], color="k", linewidth=2, label="the actor")
-        axis.set(xlabel=label, ylim=(-1, 1))
-        axis.legend(loc="upper right")
-    axes[0].set_ylabel("steering (+1 full left)")
-    figure.colorbar(image, ax=axes, label="E: probability of permissible")
-    figure.suptitle(f"What the AP predictor believes at {speed:g} km/h")
-    return figure
-
-
-@th.no_grad()
-def permissible_probability(model: Any, obs: np.ndarray[Any, Any], actions: np.ndarray[Any, Any]) -> Any:
-    """E's probability for every pair of n observations and m one-dimensional scaled actions: (n, m)."""
-    features = model.predictor.features(th.as_tensor(obs, device=model.device))
-    pairs = th.as_tensor(actions, dtype=th.float32, device=model.device).repeat(len(obs))[:, None]
-    logits = model.predictor.logits(features.repeat_interleave(len(actions), dim=0), pairs)
-    return th.sigmoid(logits).cpu().numpy().reshape(len(obs), len(actions))

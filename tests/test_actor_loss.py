@@ -113,14 +113,14 @@ def test_it_waits_until_e_is_good_enough(monkeypatch):
     assert len(calls) == 3
 
 
-def test_it_acts_once_in_so_many_updates(monkeypatch):
+def test_it_acts_as_often_as_e_is_fitted(monkeypatch):
     calls = []
     monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
-    model = build(DDPGAP, actor_permissibility_coef=1.0, permissibility_freq=3).learn(60)
+    model = build(DDPGAP, actor_permissibility_coef=1.0, refit_growth=0.25).learn(60)
     model.validation_accuracy, model._n_updates = 1.0, 2
     calls.clear()
     numbers = []
-    for updates in (1, 1, 1, 4):  # to 3, 4, 5 and 9: at 3, and at 6 and 9
+    for updates in (1, 1, 1, 4):  # to 3, 4, 5 and 9: of these 3, 4, 6, 7 and 9 are due
         model.train(updates, 8)
         numbers.append(len(calls))
-    assert numbers == [1, 1, 1, 3]
+    assert numbers == [1, 2, 2, 5]

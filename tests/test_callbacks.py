@@ -40,9 +40,6 @@ class NoCallback(BaseCallback):
         ({"train_freq": (1, "episode")}, 1, [5] * 5 + [10] * 5 + [15] * 5),
         # One fit for each vectorised step, after which two transitions are new.
         ({"train_freq": 2}, 2, [8] * 2 + [12] * 2),
-        ({"train_freq": 1, "permissibility_freq": 3}, 1, [9, 12]),
-        # The multiples of 3 are 9 and 12; a rollout ends after 8, 10 and 12.
-        ({"train_freq": 2, "permissibility_freq": 3}, 1, [10, 12]),
     ],
 )
 def test_fits_follow_the_steps_collected(settings, n_envs, expected):
@@ -58,6 +55,31 @@ def test_fits_follow_the_steps_collected(settings, n_envs, expected):
     # From the first rollout on; `expected` begins where the cases are easiest to tell apart.
     assert [step for step in callback.fits if step >= first] == expected
     assert callback.validations == sorted(set(callback.fits))
+
+
+@pytest.mark.parametrize(
+    ("growth", "steps"),
+    [
+        (0.0, list(range(1, 13))),
+        (
+            0.25,
+            [1, 2, 3, 4, 6, 7, 9, 11],
+        ),  # 4 up to step 4, then 4·(1 + ln(t/4)): 5 at 5.1, 6 at 6.6, 7 at 8.5, 8 at 10.9
+    ],
+)
+def test_fits_become_rarer_as_steps_grow(growth, steps):
+    model = build(DDPGAP, refit_growth=growth)
+    assert [now for now in range(1, 13) if model.refits_due(now - 1, now)] == steps
+    assert model.refits_due(0, 12) == len(steps)
+
+
+def test_the_callback_asks_how_many_fits_are_due():
+    callback = Recorder()
+    env = DummyVecEnv([lambda: Line(horizon=5)] * 2)
+    model = build(DDPGAP, env, refit_growth=0.1, min_per_class=1).learn(200, callback=callback)
+    late = [step for step in callback.fits if step > 100]
+    assert len(late) == model.refits_due(50, 100) == 7  # 10·ln 2
+    assert set(callback.validations) <= set(callback.fits)
 
 
 def test_nothing_is_fitted_before_each_class_has_its_minimum():

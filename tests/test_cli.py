@@ -25,7 +25,7 @@ def demo(tmp_path_factory):
 def test_demo_leaves_what_it_promises(demo):
     names = {path.name for path in demo.iterdir()}
     pictures = {"learning_curve.png", "predictor.png", "lap.gif"}
-    assert names == {"model.zip", "training.csv", "evaluation.json"} | pictures
+    assert names == {"model.zip", "run.json", "training.csv", "evaluation.json"} | pictures
     assert len(pd.read_csv(demo / "training.csv")) == 400
     rows = json.loads((demo / "evaluation.json").read_text())
     assert [row["track"] for row in rows] == ["eroad", "spring", "g-track-3", "ole-road-1"]

@@ -207,3 +207,14 @@ def test_each_part_needs_room_for_both_classes(size, fraction):
     with pytest.raises(ValueError, match=rf"`knowledge_buffer_size` = {size} with `validation_fraction` = {fraction}"):
         KnowledgeBuffer(BOX, 1, size, fraction)
     KnowledgeBuffer(BOX, 1, 16, fraction)  # round(1.6) = 2
+
+
+def test_an_unbalanced_sample_follows_the_labels():
+    knowledge = KnowledgeBuffer(spaces.Box(-1, 1, (1,)), 1, 1000, seed=0)
+    labels = np.arange(800) % 4 == 0  # a quarter is permissible
+    knowledge.add(np.zeros((800, 1)), labels[:, None], labels)
+    sample = knowledge.sample(2000, balanced=False)
+    assert len(sample.labels) == 2000
+    assert sample.labels.sum() == pytest.approx(500, abs=80)  # 4 standard deviations
+    np.testing.assert_array_equal(sample.actions[:, 0], sample.labels)  # each action beside its own label
+    assert knowledge.sample(2000).labels.sum() == 1000

@@ -13,10 +13,10 @@ PACKAGE = Path(sb3_sap.__file__).parent
 # From the top. A room may use those below it and its neighbours on the same floor.
 FLOORS = (
     {"cli"},
-    {"demo"},
-    {"zoo", "benchmark", "evaluation", "plots", "presets", "statistics"},
+    {"demo", "hub"},
+    {"zoo", "benchmark", "evaluation", "plots", "beliefs", "presets", "statistics"},
     {"algorithms"},
-    {"exploration"},
+    {"exploration", "check"},
     {"learning"},
     {
         "constraints",
@@ -29,7 +29,7 @@ FLOORS = (
         "candidates",
         "prediction",
     },
-    {"permissibility", "generators", "files", "errors"},
+    {"permissibility", "generators", "files", "errors", "advice", "tensorboard"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}
 

@@ -38,6 +38,16 @@ GROUPS: dict[str, list[str]] = {
         "ddpg_ap:default[predictor_kwargs.optimizer_class=SGD,predictor_kwargs.learning_rate=0.01]",
         *(f"ddpg_ap:default[predictor_kwargs.weight_decay={decay}]" for decay in (0, 0.01)),
         *(f"ddpg_ap:default[actor_permissibility_coef={beta}]" for beta in (0.3, 1, 3)),
+        *(f"ddpg_ap:default[candidate_selection={name}]" for name in ("nearest", "highest_q", "most_permissible")),
+        "ddpg_ap_unbalanced:default",
+        "ddpg_ap_proposed:default",
+    ],
+    # faster, and from anywhere on the track, with nothing tuned for it
+    "harder": [
+        f"{column}[{condition}]"
+        for condition in ("env.speed=80", "env.random_start=true")
+        for algo in ("ddpg", "sac", "tqc")
+        for column in (f"{algo}_ap:fast", f"{algo}:tuned")
     ],
 }
 #: Overrides that belong to the run: a training of its own length, and only the first so many seeds.

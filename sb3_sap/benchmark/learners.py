@@ -23,6 +23,8 @@ from sb3_sap.settings import SettingsMixin, make_action_noise
 #: The class of each algorithm, imported only when it is needed.
 CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
     "dqn": "stable_baselines3:DQN",
+    "ddpg_ap_unbalanced": "sb3_sap.benchmark.ablated:DDPGAPUnbalanced",
+    "ddpg_ap_proposed": "sb3_sap.benchmark.ablated:DDPGAPProposed",
     "td3": "stable_baselines3:TD3",
     "sac": "stable_baselines3:SAC",
     "tqc": "sb3_contrib:TQC",
@@ -32,6 +34,11 @@ CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} 
     "sbx_sac": "sbx:SAC",
     "sbx_tqc": "sbx:TQC",
     "sbx_crossq": "sbx:CrossQ",
+}
+#: Algorithms that take the settings of another.
+NAMESAKES = {algo: algo.removeprefix("sbx_") for algo in CLASSES if algo.startswith("sbx_")} | {
+    "ddpg_ap_unbalanced": "ddpg_ap",
+    "ddpg_ap_proposed": "ddpg_ap",
 }
 #: An override of this kind is an option of the environment, not of the algorithm.
 ENVIRONMENT = "env."
@@ -58,10 +65,11 @@ def settings_of(column: Column, simulator: str, steps: int) -> dict[str, Any]:
         known = set(base)
     else:
         known = set(inspect.signature(algorithm_class(column.algo)).parameters)
+        namesake = NAMESAKES.get(column.algo, column.algo)
         if simulator in ENVIRONMENTS:
-            base = preset(column.preset, column.algo.removeprefix("sbx_"), steps)
+            base = preset(column.preset, namesake, steps)
         else:
-            base = task_settings(column.algo, column.preset, simulator, known)
+            base = task_settings(namesake, column.preset, simulator, known)
         if column.algo.startswith("sbx_"):
             base = _for_sbx(base)
     settings = copy.deepcopy(base)

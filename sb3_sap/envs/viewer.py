@@ -6,6 +6,7 @@ road near the car is drawn; a small map shows where on the track that is.
 
 from __future__ import annotations
 
+import colorsys
 import math
 
 import numpy as np
@@ -37,6 +38,10 @@ MARGIN = 12
 """Pixels around the map and the panel's text."""
 PANEL_HEIGHT = 34
 """Pixels."""
+FAN_RADIUS = 13.0
+"""m from the middle of the car to the end of the fan."""
+FAN_OPACITY = 150
+"""Of 255."""
 
 GRASS, ASPHALT, LINE = (112, 150, 84), (138, 140, 145), (245, 245, 240)
 CAR, PANEL, ACCENT = (58, 140, 230), (28, 32, 38), (255, 190, 60)
@@ -65,14 +70,18 @@ class Viewer:
             self._window = pygame.display.set_mode(SIZE)
             pygame.display.set_caption(f"LaneKeeping · {track.name}")
 
-    def draw(self, state: CarState, steering: float) -> NDArray[np.uint8]:
+    def draw(self, state: CarState, steering: float, fan: NDArray[np.floating] | None = None) -> NDArray[np.uint8]:
         """Return the picture of a state, shape (height, width, 3), north up and the car in the middle.
 
         :param steering: the last action, in [-1, 1], positive to the left
+        :param fan: drawn before the car, if given: for steering from -1 to 1, in equal steps, the probability that it
+            is permissible, shape (n,); green where it is, red where it is not
         """
         x, y, road_heading = self.track.position(state.distance, state.track_pos * self.track.width / 2)
         self._world.move_display_window_to(np.array([x, y]))
         self._draw_road(state.distance)
+        if fan is not None:
+            self._draw_fan(x, y, road_heading - state.angle, steering, fan)
         self._draw_car(x, y, road_heading - state.angle, steering)
         upright = pygame.transform.flip(self._world, False, True)  # pixels count downwards, the plan's y upwards
         pygame.transform.smoothscale(upright, SIZE, self._picture)
@@ -113,6 +122,25 @@ class Viewer:
         car.color = CAR
         car.act({"steering": steering * STEERING_LOCK, "acceleration": 0.0})
         VehicleGraphics.display(car, self._world, offscreen=True)
+
+    def _draw_fan(self, x: float, y: float, heading: float, steering: float, fan: NDArray[np.floating]) -> None:
+        def end(action: float) -> tuple[int, int]:
+            """Where the front wheels point at, turned by an action."""
+            angle = heading + action * STEERING_LOCK
+            point: tuple[int, int] = self._world.vec2pix(
+                (x + FAN_RADIUS * math.cos(angle), y + FAN_RADIUS * math.sin(angle))
+            )
+            return point
+
+        car = self._world.vec2pix((x, y))
+        layer = pygame.Surface(self._world.get_size(), pygame.SRCALPHA)
+        half = 1 / max(len(fan) - 1, 1)
+        for action, probability in zip(np.linspace(-1, 1, len(fan)), fan, strict=True):
+            hue = float(probability) / 3  # a third of the colour wheel, from red to green
+            colour = [round(255 * part) for part in colorsys.hsv_to_rgb(hue, 0.85, 0.9)]
+            pygame.draw.polygon(layer, (*colour, FAN_OPACITY), [car, end(action - half), end(action + half)])
+        pygame.draw.line(layer, LINE, car, end(steering), 3 * OVERSAMPLING)
+        self._world.blit(layer, (0, 0))
 
     def _draw_panel(self, state: CarState, steering: float) -> None:
         top = SIZE[1] - PANEL_HEIGHT

@@ -12,6 +12,7 @@ from sb3_sap.envs.tracks.files import parse_table, read_track_xml, write_table
 from sb3_sap.envs.tracks.generate import generate_track
 from sb3_sap.envs.tracks.geometry import Piece, Segment, Track
 
+#: The paper's five tracks: TORCS' name of each, and the name that the paper calls it by.
 TRACKS = {
     "wheel-2": "Wheel-2",
     "eroad": "E-road",

@@ -1,0 +1,82 @@
+"""What guidance costs for each training step: every guided algorithm beside its own base at equal settings.
+
+The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that whatever else
+the machine does meets both; processor time is counted. The parts are measured inside the guided model.
+
+Usage: python benchmarks/bench_step_cost.py [--steps 600] [--pairs ddpg:fast ddpg:paper …]
+"""
+
+import argparse
+import inspect
+import time
+from collections import defaultdict
+from statistics import median
+
+import gymnasium as gym
+import torch as th
+
+import sb3_sap.exploration
+from sb3_sap.benchmark.learners import algorithm_class, make_model
+from sb3_sap.callbacks import PermissibilityCallback
+from sb3_sap.presets import preset
+
+PAIRS = ("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast")
+CHUNK, WARM_UP = 50, 300
+seconds: defaultdict[str, float] = defaultdict(float)
+
+
+def timed(name, function):
+    def wrapper(*args, **kwargs):
+        begun = time.process_time()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            seconds[name] += time.process_time() - begun
+
+    return wrapper
+
+
+def watch_the_parts() -> None:
+    PermissibilityCallback.fit = timed("fit E", PermissibilityCallback.fit)
+    PermissibilityCallback.validate = timed("validate E", PermissibilityCallback.validate)
+    guided = sb3_sap.exploration.ActionPermissibilityMixin
+    guided._guide = timed("Algorithm 1", guided._guide)
+    sb3_sap.exploration.permissible_actor_step = timed("teach the actor", sb3_sap.exploration.permissible_actor_step)
+
+
+def build(algo: str, settings: dict):
+    env = gym.make("sap/TorcsLaneKeeping-v0", track="wheel-2", laps=None)
+    known = inspect.signature(algorithm_class(algo)).parameters  # a base takes what it knows of its guided settings
+    return make_model(algo, env, {name: value for name, value in settings.items() if name in known}, seed=100)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--pairs", nargs="+", default=PAIRS)
+    options = parser.parse_args()
+    th.set_num_threads(1)
+    watch_the_parts()
+    parts = ("fit E", "validate E", "teach the actor", "Algorithm 1")
+    print(f"| pair | base, ms/step | guided, ms/step | ratio | {' | '.join(f'{part}, ms' for part in parts)} |")
+    print("|" + "---|" * (4 + len(parts)))
+    for pair in options.pairs:
+        base, name = pair.split(":")
+        settings = preset(name, f"{base}_ap", 3_000)
+        models = [build(algo, settings) for algo in (base, f"{base}_ap")]
+        for model in models:
+            model.learn(WARM_UP)
+        seconds.clear()
+        spent: list[list[float]] = [[], []]
+        for _ in range(options.steps // CHUNK):
+            for times, model in zip(spent, models, strict=True):
+                begun = time.process_time()
+                model.learn(CHUNK, reset_num_timesteps=False)
+                times.append((time.process_time() - begun) / CHUNK * 1000)
+        plain, guided = map(median, spent)
+        shares = " | ".join(f"{1000 * seconds[part] / options.steps:.2f}" for part in parts)
+        print(f"| {pair} | {plain:.2f} | {guided:.2f} | {guided / plain:.2f} | {shares} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""DDPG-AP with one of its parts taken out or turned round, for the benchmark's ablations alone."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from sb3_sap.algorithms import DDPGAP
+from sb3_sap.callbacks import PermissibilityCallback
+
+
+class UnbalancedFit(PermissibilityCallback):
+    """Draws D_E as K is, not balanced; validation stays balanced, so that accuracies compare."""
+
+    def fit(self) -> None:
+        """One pass over an unbalanced D_E."""
+        model = self.model
+        sample = self.knowledge.sample(model.dataset_size, env=model.get_vec_normalize_env(), balanced=False)
+        self.logger.record_mean("sap/predictor_loss", model.predictor.fit(sample))
+
+
+class DDPGAPUnbalanced(DDPGAP):
+    """E learns from the labels in the proportion in which they occur."""
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        if not isinstance(callback, (list, BaseCallback)):
+            callback = ConvertCallback(callback)
+        return super()._init_callback(
+            [UnbalancedFit(), *(callback if isinstance(callback, list) else [callback])], progress_bar
+        )
+
+
+class DDPGAPProposed(DDPGAP):
+    """The replay buffer R stores the action that the actor proposed, not the one executed; K stores the latter."""
+
+    def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+        self._proposed: np.ndarray[Any, Any] | None = None
+        action, scaled = super()._sample_action(*args, **kwargs)
+        self._proposed = scaled if self._proposed is None else self._proposed
+        return action, scaled
+
+    def _guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
+        self._proposed = actions.copy()
+        return super()._guide(actions)
+
+    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
+        super()._store_transition(replay_buffer, *args, **kwargs)
+        # Only now, because K has labelled what was executed.
+        replay_buffer.actions[replay_buffer.pos - 1] = cast("np.ndarray[Any, Any]", self._proposed)

@@ -1,0 +1,211 @@
+"""check_permissibility, against consequences that can be computed in the head."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from toy import Line, build, towards_centre
+
+from sb3_sap import DQNAP, ActionPermissibility, check_permissibility
+from sb3_sap.check import N_ACTIONS
+
+
+class FixedLine(Line):
+    """Every episode is one step from the same x."""
+
+    def __init__(self, x, **kwargs):
+        super().__init__(horizon=1, **kwargs)
+        self.start = x
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed, options={"x": self.start})
+
+
+def check(env, *args, **kwargs):
+    return check_permissibility(env, *args, **({"n_steps": 400, "verbose": False} | kwargs))
+
+
+def steps_left(obs, actions, next_obs):
+    return actions[:, 0] <= 0
+
+
+@pytest.mark.parametrize(
+    ("x", "changes"),
+    [(0.5, 1), (0.03, 2)],  # permissible: a <= 0, and -0.6 <= a <= 0
+)
+def test_label_changes_along_an_action(x, changes):
+    report = check(FixedLine(x))
+    assert report.action_matters == 1
+    assert report.label_changes == changes
+
+
+def test_random_actions_of_one_half():
+    report = check(FixedLine(0.5), n_steps=2_000)
+    assert report.permissible_rate == pytest.approx(0.5, abs=0.04)
+    assert report.accuracy > 0.95
+    assert report.policy_forbidden is None
+    assert report.own_row
+    assert report.advice == ()
+
+
+@pytest.mark.parametrize(("action", "forbidden"), [(-1, 0), (1, 1)])
+def test_share_of_the_policys_actions_that_are_forbidden(action, forbidden):
+    report = check(FixedLine(0.5), policy=lambda obs: np.full(1, action, dtype=np.float32))
+    assert report.policy_forbidden == forbidden
+    assert any("your policy's own actions" in sentence for sentence in report.advice) == bool(forbidden)
+
+
+def test_a_policy_of_sb3_is_asked_for_its_deterministic_action():
+    env = FixedLine(0.5, n_actions=2)
+    model = build(DQNAP, env, policy_kwargs={"net_arch": []}, exploration_initial_eps=1.0, exploration_final_eps=1.0)
+    with th.no_grad():
+        model.q_net.q_net[0].weight.zero_()
+        model.q_net.q_net[0].bias.copy_(th.tensor([1.0, 0.0]))  # always left
+    assert check(env, policy=model).policy_forbidden == 0
+
+
+def test_finite_actions_have_no_order():
+    report = check(FixedLine(0.5, n_actions=3))  # left, stay, right
+    assert report.permissible_rate == pytest.approx(2 / 3, abs=0.08)
+    assert report.action_matters == 1
+    assert report.label_changes is None
+
+
+@pytest.mark.parametrize("kind", ["array", "dict", "goal"])
+def test_labels_by_info_and_by_function_agree(kind):
+    by_info = check(FixedLine(0.5, kind=kind))
+    if kind != "goal":
+        assert check(FixedLine(0.5, kind=kind, labels=False), towards_centre) == by_info
+    assert check(FixedLine(0.5, kind=kind, labels=False, reuse=kind == "array"), "test_check.steps_left") == by_info
+
+
+def test_units_and_several_dimensions():
+    report = check(FixedLine(0.5, dim=3, low=-20.0, high=60.0), n_steps=2_000)
+    # x' = x + 0.1 · mean: along one dimension a threshold, where the two others leave it any say.
+    assert report.label_changes == 1
+    assert 0 < report.action_matters < 1
+    assert report.accuracy > 0.9
+
+
+def test_constant_labels():
+    report = check(FixedLine(0.5), lambda obs, actions, next_obs: np.ones(len(actions), dtype=bool))
+    assert report.permissible_rate == 1
+    assert report.action_matters == 0
+    assert report.accuracy is None
+    assert len(report.advice) == 1
+    assert "constant labels" in report.advice[0]
+
+
+def test_rare_labels_are_told_with_the_steps_they_take():
+    report = check(Line(horizon=100), lambda obs, actions, next_obs: next_obs[:, 1] < 0.995)  # every hundredth step
+    assert report.permissible_rate == 0.99
+    assert any("after about 2,000 steps" in sentence for sentence in report.advice)
+
+
+def test_labels_that_the_action_does_not_decide():
+    report = check(Line(), lambda obs, actions, next_obs: obs[:, 1] < 0.45)
+    assert report.action_matters == 0
+    assert any("does the label depend on the action" in sentence for sentence in report.advice)
+
+
+def test_labels_that_cannot_be_foreseen_are_rough():
+    def parity(obs, actions, next_obs):
+        return np.floor(actions[:, 0] * 100).astype(int) % 7 < 4
+
+    report = check(FixedLine(0.5), parity, n_steps=1_000)
+    assert report.label_changes > 4
+    assert report.accuracy < 0.7
+    assert report.own_row
+    assert len(report.advice) == 2
+
+
+@pytest.mark.parametrize("trap", ["batch", "random"])
+def test_labels_that_depend_on_more_than_their_row(trap):
+    rng = np.random.default_rng(0)
+
+    def function(obs, actions, next_obs):
+        return actions[:, 0] < (actions[0, 0] if trap == "batch" else rng.uniform(-1, 1, len(actions)))
+
+    report = check(FixedLine(0.5), function)
+    assert not report.own_row
+    assert any("in another order" in sentence for sentence in report.advice)
+
+
+def test_an_environment_that_forgets_its_seed():
+    class Forgetful(Line):
+        def reset(self, *, seed=None, options=None):
+            return super().reset(options={"x": np.random.default_rng().uniform(0.5, 1)})
+
+    report = check(Forgetful())
+    assert report.action_matters is None
+    assert report.label_changes is None
+    assert report.permissible_rate > 0
+
+
+def test_the_same_seed_gives_the_same_report_and_the_callers_generators_are_left_alone():
+    th.manual_seed(3)
+    before = th.rand(1)
+    th.manual_seed(3)
+    one, other, another = (check(Line(), seed=seed) for seed in (1, 1, 2))
+    assert th.rand(1) == before
+    assert one == other
+    assert one != another
+
+
+def test_the_report_is_printed(capsys):
+    report = check_permissibility(FixedLine(0.5), n_steps=400)
+    assert str(report) in capsys.readouterr().out
+    assert "Nothing speaks against" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "sentence"),
+    [
+        ({"env": 3}, TypeError, "single Gymnasium environment"),
+        ({"n_steps": 10}, ValueError, "at least 100"),
+        ({"env": Line(labels=False)}, ValueError, "There is no AP function"),
+        ({"policy": 3}, TypeError, "SB3's `predict`"),
+        ({"env": Line(low=-np.inf, high=np.inf)}, ValueError, "bounded"),
+        (
+            {"env": gym.make("Blackjack-v1").unwrapped, "ap_function": "nowhere.nothing"},
+            ValueError,
+            "cannot be imported",
+        ),
+    ],
+)
+def test_what_cannot_be_checked_is_told(arguments, error, sentence):
+    with pytest.raises(error, match=sentence):
+        check(**({"env": Line()} | arguments))
+
+
+def energy_did_not_fall(obs, actions, next_obs):
+    def energy(o):
+        return 0.5 * o[:, 1] ** 2 + 0.0025 / 3 * np.sin(3 * o[:, 0])
+
+    return energy(next_obs) >= energy(obs)
+
+
+def test_mountain_car():
+    env = gym.make("MountainCarContinuous-v0")
+    with_velocity, against = (
+        check(env, energy_did_not_fall, policy=lambda obs, sign=sign: sign * np.sign(obs[1:])) for sign in (1, -1)
+    )
+    # Pushing against the motion loses energy; with it, only where the car hits the wall or Euler's steps are coarse.
+    assert with_velocity.policy_forbidden < 0.1 < 0.4 < against.policy_forbidden
+    assert with_velocity.accuracy > 0.7
+
+
+def test_lane_keeping_forbids_good_actions_near_the_axis():
+    """Equation (6) is not what Definition 3 wants: on the axis itself every way leads away from it."""
+    env = gym.make("sap/LaneKeeping-v0", laps=None)
+
+    def linear(obs):
+        return np.clip(2.5 * obs[:1] / 0.366519 - 1.6 * obs[1:2] + obs[3:4], -1, 1)
+
+    strict = check(env, policy=linear)
+    beside = ActionPermissibility(
+        gym.make("sap/LaneKeeping-v0", laps=None), lambda s, a, s2: bool(abs(s2[1]) - abs(s[1]) <= 0.05)
+    )
+    assert strict.policy_forbidden > 0.1
+    assert check(beside, policy=linear).policy_forbidden < strict.policy_forbidden / 2
+    assert N_ACTIONS % 2 == 1  # the sweep holds steering straight ahead

@@ -1,0 +1,104 @@
+"""`sb3-sap push-to-hub`, up to the call over the network."""
+
+import json
+
+import pytest
+from huggingface_hub import HfApi, ModelCard
+from toy import build
+
+from sb3_sap import DDPGAP
+from sb3_sap.cli import main
+
+LAPS = [
+    {"track": "eroad", "lap_done": True, "covered": 1.0, "total_reward": 1.0, "score": 0.9, "steps": 1},
+    {"track": "spring", "lap_done": False, "covered": 0.5, "total_reward": 1.0, "score": 0.4, "steps": 1},
+]
+COMMAND = "sb3-sap demo --algo ddpg_ap --seed 3"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """What a demo leaves."""
+    folder = tmp_path / "demo_output"
+    folder.mkdir()
+    build(DDPGAP).save(folder / "model.zip")
+    (folder / "run.json").write_text(json.dumps({"algo": "ddpg_ap", "simulator": "torcs", "command": COMMAND}))
+    (folder / "evaluation.json").write_text(json.dumps(LAPS))
+    (folder / "predictor.png").write_bytes(b"picture")
+    return folder
+
+
+@pytest.fixture
+def uploads(monkeypatch):
+    """What would go over the network."""
+    calls = []
+
+    def create_repo(api, repo_id, **kwargs):
+        calls.append(("create", repo_id))
+        return type("Url", (str,), {"repo_id": repo_id})(repo_id)
+
+    monkeypatch.setattr(HfApi, "create_repo", create_repo)
+    monkeypatch.setattr(
+        HfApi, "upload_file", lambda api, *, path_in_repo, repo_id, **kwargs: calls.append((path_in_repo, repo_id))
+    )
+    return calls
+
+
+def push(*arguments):
+    return main(["push-to-hub", *map(str, arguments)])
+
+
+def test_everything_is_uploaded_and_the_card_comes_last(run, uploads):
+    assert push(run, "--repo-id", "me/car") == 0
+    files = [name for name, repo_id in uploads if name != "create" and repo_id == "me/car"]
+    model = "ddpg_ap-sap-TorcsLaneKeeping-v0.zip"
+    assert files == [model, "predictor.png", "evaluation.json", "README.md"]
+    assert (run / "hub" / model).read_bytes() == (run / "model.zip").read_bytes()
+
+
+def test_the_card_tells_results_command_and_use(run, uploads):
+    assert push(run, "--repo-id", "me/car", "--dry-run") == 0
+    assert uploads == []
+    card = ModelCard.load(run / "hub" / "README.md")
+    [result] = card.data.eval_results
+    assert (result.metric_type, result.metric_value) == ("mean_score", "0.650")
+    assert card.data.library_name == "stable-baselines3"
+    assert "sap/TorcsLaneKeeping-v0" in card.data.tags
+    assert "| spring | 50.0% | 0.400 |" in card.text
+    assert f"```\n{COMMAND}\n```" in card.text
+    assert "![predictor](predictor.png)" in card.text
+    assert "lap.gif" not in card.text  # the run left none
+    assert 'DDPGAP.load(load_from_hub("me/car", "ddpg_ap-sap-TorcsLaneKeeping-v0.zip"))' in card.text
+
+
+def test_any_other_model_is_evaluated(tmp_path, uploads):
+    from stable_baselines3 import DDPG
+
+    DDPG("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "pendulum")
+    named = ["--algo", "ddpg", "--env", "Pendulum-v1", "--command", "by hand", "--episodes", 2]
+    assert push(tmp_path / "pendulum.zip", "--repo-id", "me/p", "--out", tmp_path / "out", *named) == 0
+    [result] = ModelCard.load(tmp_path / "out" / "README.md").data.eval_results
+    assert result.metric_type == "mean_reward"
+    assert float(result.metric_value.split(" +/- ")[0]) < 0
+    assert [name for name, _ in uploads if name != "create"] == ["ddpg-Pendulum-v1.zip", "README.md"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--repo-id", "no spaces please"], "Repo id"),
+        (["--repo-id", "me/car", "--algo", "dppg"], "did you mean 'ddpg'"),
+    ],
+)
+def test_what_cannot_be_pushed_is_told(run, uploads, capsys, arguments, sentence):
+    assert push(run, *arguments) == 1
+    assert sentence in capsys.readouterr().err
+    assert uploads == []
+
+
+def test_what_a_file_does_not_say_is_asked_for(run, uploads, capsys):
+    (run / "run.json").unlink()
+    assert push(run, "--repo-id", "me/car") == 1
+    assert "add --algo and --env and --command" in capsys.readouterr().err
+    assert push(run / "nothing.zip", "--repo-id", "me/car") == 1
+    assert "There is no model" in capsys.readouterr().err

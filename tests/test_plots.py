@@ -1,0 +1,183 @@
+"""Pictures, judged by the numbers in them."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_viewer import eastward
+from toy import Line, build
+
+from sb3_sap import DDPGAP, DQNAP
+from sb3_sap.beliefs import permissible_probability
+from sb3_sap.envs.viewer import LINE
+from sb3_sap.plots import plot_permissibility, return_curves, save
+from sb3_sap.tensorboard import LAYOUT
+
+LINEAR = {"net_arch": []}  # E is one linear layer
+
+
+def linear_model(weights, algorithm=DDPGAP, env=None, **kwargs):
+    """A model whose E is the sigmoid of a weighted sum of (observation, action)."""
+    model = build(algorithm, env, predictor_kwargs=LINEAR, **kwargs)
+    with th.no_grad():
+        model.predictor.head[0].weight.copy_(th.tensor([weights]))
+        model.predictor.head[0].bias.zero_()
+    model.predictor.n_updates += 1
+    return model
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-np.asarray(x)))
+
+
+def mesh(figure):
+    """(actions, values) of the picture, as drawn, and the actor's line."""
+    axis = figure.axes[0]
+    image = np.asarray(axis.collections[0].get_array())
+    return image, axis.lines[0].get_xdata(), axis.lines[0].get_ydata()
+
+
+def test_probability_of_every_state_and_action():
+    model = linear_model([2.0, 0.0, 3.0], env=Line(low=-20.0, high=60.0))
+    obs = np.array([[0.5, 0.0], [-1.0, 0.3]], dtype=np.float32)
+    actions = np.array([[-20.0], [20.0], [60.0]])  # scaled: -1, 0, 1
+    expected = sigmoid([[-2, 1, 4], [-5, -2, 1]])
+    assert permissible_probability(model, obs, actions) == pytest.approx(expected, abs=1e-6)
+    per_state = np.stack([actions, actions[::-1]])
+    expected[1] = expected[1, ::-1]
+    assert permissible_probability(model, obs, per_state) == pytest.approx(expected, abs=1e-6)
+
+
+def test_region_over_a_variable_and_an_action(tmp_path):
+    model = linear_model([2.0, 1.0, 3.0])
+    figure = plot_permissibility(model, 0, obs=np.array([9.0, 0.5], np.float32), limits=(-2, 2), variable_name="x [m]")
+    image, values, actor = mesh(figure)
+    assert image[0, 0] == pytest.approx(sigmoid(2 * -2 + 1 * 0.5 + 3 * -1))  # lowest action, lowest x
+    assert image[-1, 0] == pytest.approx(sigmoid(2 * -2 + 1 * 0.5 + 3 * 1))
+    assert image[0, -1] == pytest.approx(sigmoid(2 * 2 + 1 * 0.5 + 3 * -1))
+    assert (values[0], values[-1]) == (-2, 2)
+    states = np.column_stack([values, np.full(len(values), 0.5)]).astype(np.float32)
+    assert actor == pytest.approx(model.predict(states, deterministic=True)[0][:, 0])
+    assert figure.axes[0].get_xlabel() == "x [m]"
+    save(figure, tmp_path / "region.png")
+    assert (tmp_path / "region.png").stat().st_size > 5_000
+
+
+def test_the_other_actions_are_the_actors():
+    model = linear_model([0.0, 0.0, 0.0, 3.0], env=Line(dim=2))
+    image, values, _ = mesh(plot_permissibility(model, action=0, limits=(-1, 1), obs=np.zeros(2, np.float32)))
+    states = np.column_stack([values, np.zeros(len(values))]).astype(np.float32)
+    second = model.predict(states, deterministic=True)[0][:, 1]
+    assert image == pytest.approx(np.tile(sigmoid(3 * second), (len(image), 1)), abs=1e-6)
+
+
+def test_a_key_of_a_dictionary():
+    model = linear_model([1.0, 2.0, 0.0], env=Line("dict"), policy="MultiInputPolicy")  # keys: time, x, action
+    held = {"x": np.zeros(1, np.float32), "time": np.full(1, 3.0, np.float32)}
+    figure = plot_permissibility(model, ("x", 0), obs=held, limits=(-1, 1))
+    assert mesh(figure)[0][0, [0, -1]] == pytest.approx(sigmoid([3 - 2, 3 + 2]))
+    assert figure.axes[0].get_xlabel() == "observation x[0]"
+
+
+def test_finite_actions():
+    model = linear_model([0.0, 0.0, 1.0, 2.0, 3.0], DQNAP)
+    image, values, actor = mesh(plot_permissibility(model, limits=(-1, 1)))
+    assert image[:, 0] == pytest.approx(sigmoid([1, 2, 3]))
+    assert set(actor) <= {0, 1, 2}
+    assert len(actor) == len(values)
+
+
+def test_what_k_holds_gives_limits_and_the_state_that_is_held():
+    model = build(DDPGAP).learn(100)
+    generator = model.replay_buffer.knowledge.rng.bit_generator.state
+    _, values, _ = mesh(plot_permissibility(model, 1))
+    assert -0.2 <= values[0] < values[-1] <= 1  # steps / horizon
+    assert model.replay_buffer.knowledge.rng.bit_generator.state == generator
+
+
+def test_after_load_there_is_no_k(tmp_path):
+    build(DDPGAP).learn(100).save(tmp_path / "model")
+    _, values, _ = mesh(plot_permissibility(DDPGAP.load(tmp_path / "model")))
+    assert (values[0], values[-1]) == (-1, 1)
+
+
+def test_axes_are_in_the_environments_units_whatever_the_policy_sees():
+    env = VecNormalize(DummyVecEnv([Line]))
+    env.obs_rms.mean, env.obs_rms.var = np.array([5.0, 0.0]), np.array([4.0, 1.0])
+    model = linear_model([1.0, 0.0, 0.0], env=env)
+    image, _, _ = mesh(plot_permissibility(model, limits=(3, 7), obs=np.zeros(2, np.float32)))
+    assert image[0, [0, -1]] == pytest.approx(sigmoid([-1, 1]), abs=1e-3)
+
+
+@pytest.mark.parametrize("arguments", [{"variable": 2}, {"variable": -1}, {"action": 1}])
+def test_indices_that_do_not_exist_are_told(arguments):
+    with pytest.raises(ValueError, match="no such variable"):
+        plot_permissibility(linear_model([0.0, 0.0, 0.0]), **arguments)
+
+
+def test_without_a_fitted_predictor_there_is_nothing_to_draw():
+    with pytest.raises(ValueError, match="train it first"):
+        plot_permissibility(build(DDPGAP))
+
+
+def test_return_curves(tmp_path):
+    for name, returns in {"a": [1, 3], "b": [5, 7]}.items():
+        rows = "".join(f"{r},10,{10 * i}\n" for i, r in enumerate(returns))
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "monitor.csv").write_text('#{"t_start": 0, "env_id": "x"}\nr,l,t\n' + rows)
+    (tmp_path / "c.monitor.csv").write_text((tmp_path / "a" / "monitor.csv").read_text())  # Monitor(env, "c")
+    axis = return_curves({"both": [tmp_path / "a", tmp_path / "b"], "one": tmp_path / "c"}, window=1).axes[0]
+    faint, _, mean, one = axis.lines
+    assert faint.get_xydata().tolist() == [[10, 1], [20, 3]]
+    assert mean.get_ydata()[[0, -1]].tolist() == [3, 5]
+    assert one.get_ydata()[[0, -1]].tolist() == [1, 3]
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["both", "one"]
+
+
+def test_missing_monitor_files_are_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="as SB3's Monitor writes"):
+        return_curves({"a": tmp_path / "nothing"})
+
+
+def red_green(pixel):
+    return "green" if pixel[1] > pixel[0] + 30 else "red" if pixel[0] > pixel[1] + 30 else "neither"
+
+
+def test_the_fan_shows_the_verdict_on_each_steering_angle():
+    # The car drives east: left is up. Permissible is steering to the left.
+    picture = draw_fan(np.repeat([0.0, 1.0], 11))
+    (row, column), ahead = middle(picture), 95  # 95 pixels are 10.6 m
+    assert red_green(picture[row - 25, column + ahead]) == "green"
+    assert red_green(picture[row + 25, column + ahead]) == "red"
+    assert tuple(picture[row, column + ahead]) == LINE  # straight ahead is what it will do
+
+
+def test_without_a_fan_nothing_changes():
+    assert np.array_equal(eastward(), draw_fan(None))
+
+
+def middle(picture):
+    return picture.shape[0] // 2, picture.shape[1] // 2
+
+
+def draw_fan(fan):
+    from sb3_sap.envs import CarState
+    from sb3_sap.envs.tracks import Segment, Track
+    from sb3_sap.envs.viewer import Viewer
+
+    viewer = Viewer(Track("straight", 12, [Segment.straight(1000), Segment.curve(1.0, 100)]))
+    return viewer.draw(CarState(0.0, 0.0, 50, 0, 0, 500.0), 0.0, fan)
+
+
+def test_tensorboard_gets_the_layout(tmp_path):
+    build(DDPGAP, tensorboard_log=str(tmp_path)).learn(100, log_interval=1)
+    [run] = tmp_path.iterdir()
+    events = EventAccumulator(str(run)).Reload()
+    config = events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
+    for category, charts in LAYOUT.items():
+        assert category.encode() in config
+        assert all(chart.encode() in config for chart in charts)
+    drawn = {tag for charts in LAYOUT.values() for _, tags in charts.values() for tag in tags}
+    # Without actor loss and evaluation, every other curve is there.
+    assert drawn - set(events.Tags()["scalars"]) == {"sap/actor_loss", "eval/mean_reward"}

@@ -20,6 +20,7 @@ from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import FloatArray
 from sb3_sap.prediction import guided_prediction
 from sb3_sap.predictor import candidate_logits, flush_denormals
+from sb3_sap.settings import as_schedule
 
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
@@ -34,8 +35,9 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         ``learning_starts``, whose uniform random steps count inside it
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
-    :param actor_permissibility_coef: β of the permissible actor loss, a number or an SB3 schedule; 0 is the paper's
-        method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for ``alpha``
+    :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
+        paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for
+        ``alpha``
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.
@@ -51,14 +53,14 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         alpha_low: float = 0.5,
         t_k: int | None = None,
         candidate_selection: str = "random",
-        actor_permissibility_coef: float | Schedule = 0.0,
+        actor_permissibility_coef: float | Schedule | str = 0.0,
         **kwargs: Any,
     ):
         self.alpha = alpha
         self.alpha_low = alpha_low
         self.t_k = t_k
         self.candidate_selection = candidate_selection
-        self.actor_permissibility_coef = actor_permissibility_coef
+        self.actor_permissibility_coef = as_schedule(actor_permissibility_coef, "actor_permissibility_coef")
         self._steps_of_earlier_learns = 0
         super().__init__(*args, **kwargs)
 

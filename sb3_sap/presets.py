@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import resources
 from typing import Any
 
@@ -28,6 +29,8 @@ RUNNER_KEYS = frozenset(
 )
 #: The paper chose t_k by the length of the run: up to so many steps, entries named ``<preset>-3k`` hold.
 SHORT_RUN = 3_000
+#: What the name of a Gymnasium environment looks like; presets have no such names.
+_ENVIRONMENT = re.compile(r"/|-v\d+$")
 
 
 def algorithms() -> list[str]:
@@ -46,7 +49,7 @@ def load_config(algo: str) -> dict[str, dict[str, Any]]:
 
 def preset_names(algo: str = "ddpg_ap") -> list[str]:
     """The presets of an algorithm: the entries that are no environments, the constructor's own settings among them."""
-    return [name for name in load_config(algo) if "/" not in name and not name.endswith("-3k")]
+    return [name for name in load_config(algo) if not _ENVIRONMENT.search(name) and not name.endswith("-3k")]
 
 
 def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[str, Any]:
@@ -61,6 +64,11 @@ def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[s
     entries = load_config(algo)
     short = f"{name}-3k"
     entry = entries[short if steps is not None and steps <= SHORT_RUN and short in entries else name]
+    return settings_in(entry)
+
+
+def settings_in(entry: dict[str, Any]) -> dict[str, Any]:
+    """The constructor arguments among an entry's keys."""
     return {key: value for key, value in entry.items() if key not in RUNNER_KEYS}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from io import BufferedIOBase
 from pathlib import Path
@@ -15,10 +16,12 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, update_learning_rate
 
 #: Training steps of the paper's main experiment (section 5.2).
 PAPER_STEPS = 15_000
+#: RL Zoo's way to write a schedule that falls evenly to 0.
+LINEAR = r"lin_\d+\.?\d*(e-?\d+)?"
 NOISES: dict[str, Callable[..., ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -29,7 +32,8 @@ class SettingsMixin(OffPolicyAlgorithm):
     """Goes before an SB3 off-policy algorithm in the bases of a class.
 
     :param actor_learning_rate: of the actor alone, a number or an SB3 schedule; the paper's actor learns ten times
-        slower than its critic (section 5.1). ``None``: ``learning_rate``
+        slower than its critic (section 5.1). ``None``: ``learning_rate``. A schedule may be written as in YAML, too:
+        ``"lin_0.001"`` falls evenly from 0.001 to 0 over the training
     :param action_noise: besides an SB3 ``ActionNoise``, its description as YAML can write it:
         ``{"type": "normal", "sigma": 0.1}`` or ``{"type": "ornstein-uhlenbeck", "sigma": 0.3, "theta": 0.6, "dt": 1}``
     """
@@ -42,10 +46,12 @@ class SettingsMixin(OffPolicyAlgorithm):
         policy: Any,
         env: Any,
         *args: Any,
-        actor_learning_rate: float | Schedule | None = None,
+        actor_learning_rate: float | Schedule | str | None = None,
         **kwargs: Any,
     ):
-        self.actor_learning_rate = actor_learning_rate
+        self.actor_learning_rate = as_schedule(actor_learning_rate, "actor_learning_rate")
+        if "learning_rate" in kwargs:
+            kwargs["learning_rate"] = as_schedule(kwargs["learning_rate"], "learning_rate")
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             check_action_space(type(self).__name__, env.action_space, self.discrete)
@@ -146,6 +152,18 @@ def check_at_least(model: Any, **minima: int) -> None:
     for name, minimum in minima.items():
         if getattr(model, name) < minimum:
             raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(model, name)}.")
+
+
+def as_schedule(value: Any, argument: str) -> Any:
+    """A number or schedule as it is; of RL Zoo's ``"lin_<number>"`` the schedule that falls from that number to 0.
+
+    :param argument: the name of the constructor argument, for the error message
+    """
+    if not isinstance(value, str):
+        return value
+    if not re.fullmatch(LINEAR, value):
+        raise ValueError(f'`{argument}` must be a number, a schedule or "lin_<number>", but is {value!r}.')
+    return LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
 
 
 def make_action_noise(description: Mapping[str, Any], action_space: spaces.Space[Any]) -> ActionNoise:

@@ -87,6 +87,16 @@ def test_zero_is_the_papers_method_to_the_bit_and_a_schedule_works():
     assert same(weights(plain.policy), weights(zero.policy))
     some = build(DDPGAP, actor_permissibility_coef=lambda remaining: remaining).learn(80)
     assert not same(weights(plain.policy), weights(some.policy))
+    from_yaml = build(DDPGAP, actor_permissibility_coef="lin_1.0").learn(80)
+    assert same(weights(some.policy), weights(from_yaml.policy))
+
+
+@pytest.mark.parametrize("value", ["const_1", "lin_", "lin_x", "1"])
+def test_a_schedule_that_is_none_is_told(value):
+    with pytest.raises(
+        ValueError, match=r"`actor_permissibility_coef` must be a number, a schedule or \"lin_<number>\""
+    ):
+        build(DDPGAP, actor_permissibility_coef=value)
 
 
 def test_it_waits_until_e_is_good_enough(monkeypatch):

@@ -91,6 +91,12 @@ def test_environments_know_no_algorithm():
     assert not [name for path in paths for name in imports(path) if name.startswith(("stable_baselines3", "torch"))]
 
 
+def test_ap_functions_of_tasks_know_what_an_environment_may():
+    assert rooms_used(rooms()["tasks"]) - {"tasks"} == {"permissibility"}
+    foreign = {name.split(".")[0] for path in rooms()["tasks"] for name in imports(path)} - sys.stdlib_module_names
+    assert foreign == {"numpy", "sb3_sap"}
+
+
 def test_the_ap_function_knows_numpy_and_gymnasium_alone():
     foreign = {name.split(".")[0] for name in imports(PACKAGE / "permissibility.py")} - sys.stdlib_module_names
     assert foreign == {"gymnasium", "numpy"}

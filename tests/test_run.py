@@ -139,8 +139,9 @@ def rates(model):
         ({"learning_rate": 0.02, "actor_learning_rate": 0.002}, [0.002, 0.02]),
         ({"learning_rate": 0.02, "actor_learning_rate": lambda remaining: 0.002 * remaining}, [0.001, 0.02]),
         ({"learning_rate": lambda r: 0.02 * r, "actor_learning_rate": 0.002}, [0.002, 0.01]),
+        ({"learning_rate": "lin_0.02", "actor_learning_rate": "lin_2e-3"}, [0.001, 0.01]),
     ],
-    ids=["number", "schedule", "two numbers", "actor schedule", "critic schedule"],
+    ids=["number", "schedule", "two numbers", "actor schedule", "critic schedule", "as YAML writes them"],
 )
 @every_algorithm
 def test_learning_rates(algorithm, settings, expected, tmp_path):

@@ -12,6 +12,8 @@ from typing import Any
 from sb3_sap.benchmark.columns import Column
 from sb3_sap.benchmark.learners import defaults_of, environment_of, settings_of
 from sb3_sap.benchmark.paper import TEST_TRACKS
+from sb3_sap.benchmark.tasks import entry, evaluations
+from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.files import atomic_path
 
 #: Training steps after which the actor drives a lap of each test track; and at the end of the training.
@@ -24,7 +26,7 @@ TASK_OPTIONS = ("speed", "control_step", "car")
 class Cell:
     """A training run. Two cells that are equal have the same result."""
 
-    simulator: str
+    simulator: str  # of `ENVIRONMENTS`, or the id of an environment beyond lane keeping
     algo: str
     settings: dict[str, Any]  # constructor arguments
     defaults: dict[str, Any]  # the constructor's own values of the others
@@ -52,11 +54,16 @@ class Cell:
 
 def make_cell(column: Column, simulator: str, steps: int, seed: int, tracks: Iterable[str] = TEST_TRACKS) -> Cell:
     """The cell of a column and a seed, its settings resolved."""
+    steps = column.of_run("steps", steps)
     settings = settings_of(column, simulator, steps)
-    training = {"track": "wheel-2", "laps": None} | environment_of(column)
-    if column.algo == "linear":  # nothing to learn, nothing random
-        steps = seed = 0
-    checkpoints = sorted({point for point in CHECKPOINTS if point < steps} | {steps})
+    if simulator in ENVIRONMENTS:
+        training = {"track": "wheel-2", "laps": None} | environment_of(column)
+        if column.algo == "linear":  # nothing to learn, nothing random
+            steps = seed = 0
+        checkpoints = sorted({point for point in CHECKPOINTS if point < steps} | {steps})
+    else:
+        training = entry(column.algo, simulator).get("env_kwargs", {}) | environment_of(column)
+        checkpoints = evaluations(steps)
     defaults = defaults_of(column, settings)
     return Cell(simulator, column.algo, settings, defaults, training, steps, seed, list(tracks), checkpoints)
 
@@ -68,7 +75,8 @@ def make_grid(
     seeds, tracks = list(seeds), list(tracks)
     return {
         column: [
-            make_cell(column, simulator, steps, seed, tracks) for seed in (seeds if column.algo != "linear" else [0])
+            make_cell(column, simulator, steps, seed, tracks)
+            for seed in (seeds[: column.of_run("seeds", len(seeds))] if column.algo != "linear" else [0])
         ]
         for column in columns
     }

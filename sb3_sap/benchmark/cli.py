@@ -50,6 +50,12 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     _add_grid(command, steps=False)
     _add_workers(command)
     command.set_defaults(run=_with_extra(_claims), columns=["paper"], tracks=list(TEST_TRACKS))
+    command = actions.add_parser("task", help="a task beyond lane keeping: guided, its base, RL Zoo's tuned settings")
+    command.add_argument("simulator", metavar="ENV_ID", help="environment with a guided entry in zoo_configs")
+    _add_columns(command, [])
+    _add_grid(command, lane_keeping=False)
+    _add_workers(command)
+    command.set_defaults(run=_with_extra(_task))
     command = actions.add_parser("report", help="write all of these from the runs that there are; runs nothing")
     _add_grid(command)
     command.set_defaults(run=_with_extra(_report_all))
@@ -61,19 +67,23 @@ def _add_columns(command: argparse.ArgumentParser, columns: list[str]) -> None:
         nargs="+",
         default=columns,
         metavar="COLUMN",
-        help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, sbx, ablations, all",
+        help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, sbx, ablations, all; "
+        "of a task the presets are task, tuned and default",
     )
 
 
-def _add_grid(command: argparse.ArgumentParser, steps: bool = True) -> None:
+def _add_grid(command: argparse.ArgumentParser, steps: bool = True, lane_keeping: bool = True) -> None:
     command.formatter_class = argparse.ArgumentDefaultsHelpFormatter
-    command.add_argument("--simulator", choices=list(ENVIRONMENTS), default="torcs", help="what the car drives on")
-    if steps:
+    if lane_keeping:
+        command.add_argument("--simulator", choices=list(ENVIRONMENTS), default="torcs", help="what the car drives on")
+    else:
+        command.add_argument("--steps", type=_positive, help="training steps; None: those of the guided entry")
+    if steps and lane_keeping:
         command.add_argument("--steps", type=_positive, default=3_000, help="training steps")
         command.add_argument("--tracks", nargs="+", default=list(TEST_TRACKS), metavar="TRACK", help="unseen tracks")
     command.add_argument("--seeds", type=_positive, default=10, metavar="N", help="training runs of each column")
     command.add_argument("--first-seed", type=int, default=0, metavar="SEED", help="100 and up to choose settings")
-    command.add_argument("--out", type=Path, default=Path("docs/results"), help="holds a folder SIMULATOR-STEPS")
+    command.add_argument("--out", type=Path, default=Path("docs/results"), help="holds a folder of each grid")
 
 
 def _add_workers(command: argparse.ArgumentParser) -> None:
@@ -101,6 +111,17 @@ def _run(options: argparse.Namespace, console: Console) -> int:
 def _report(options: argparse.Namespace, console: Console) -> int:
     failed = _run_missing(options, options.steps, console)
     _write(options, options.report, console)
+    return int(failed > 0)
+
+
+def _task(options: argparse.Namespace, console: Console) -> int:
+    from sb3_sap.benchmark.tasks import EPISODES, planned_steps, task_columns
+
+    options.tracks = list(EPISODES)
+    options.steps = options.steps or planned_steps(options.simulator)
+    options.columns = options.columns or task_columns(options.simulator)
+    failed = _run_missing(options, options.steps, console)
+    _write(options, "returns", console)
     return int(failed > 0)
 
 
@@ -135,7 +156,7 @@ def _run_missing(options: argparse.Namespace, steps: int, console: Console) -> i
 
 
 def _write(options: argparse.Namespace, name: str, console: Console, known_alone: bool = False) -> None:
-    from sb3_sap.benchmark import figures, tables
+    from sb3_sap.benchmark import figures, returns, tables
     from sb3_sap.benchmark.results import collect
 
     folder = _folder(options, options.steps)
@@ -147,6 +168,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, known_alone
         "curve": figures.curve,
         "summary": tables.summary,
         "ablations": tables.ablations,
+        "returns": returns.returns,
     }[name]
     write(results, folder, command_line(options, name))
     console.print(f"wrote {folder / name}.md", soft_wrap=True)
@@ -186,19 +208,22 @@ def _grid(options: argparse.Namespace, steps: int, known_alone: bool = False) ->
 
 
 def _folder(options: argparse.Namespace, steps: int) -> Path:
-    folder: Path = options.out / f"{options.simulator}-{steps}"
+    # A task's runs may differ in length; the id's namespace is no folder.
+    task = options.simulator not in ENVIRONMENTS
+    folder: Path = options.out / (options.simulator.rpartition("/")[2] if task else f"{options.simulator}-{steps}")
     return folder
 
 
 def command_line(options: argparse.Namespace, name: str) -> str:
     """The command that makes a report, without what does not change it."""
-    words = ["sb3-sap", "benchmark", name, "--simulator", options.simulator]
+    task = name == "returns"
+    words = ["sb3-sap", "benchmark", *(["task"] if task else [name, "--simulator"]), options.simulator]
     words += [] if name == "claims" else ["--steps", str(options.steps)]
     words += ["--seeds", str(options.seeds)]
     words += ["--first-seed", str(options.first_seed)] if options.first_seed else []
     default = REPORTS[name][0] if name in REPORTS else ["paper"]
     words += ["--columns", *options.columns] if options.columns != default else []
-    words += ["--tracks", *options.tracks] if options.tracks != list(TEST_TRACKS) else []
+    words += ["--tracks", *options.tracks] if not task and options.tracks != list(TEST_TRACKS) else []
     return shlex.join(words)
 
 

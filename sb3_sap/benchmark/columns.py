@@ -50,6 +50,8 @@ GROUPS: dict[str, list[str]] = {
         for column in (f"{algo}_ap:fast", f"{algo}:tuned")
     ],
 }
+#: Overrides that belong to the run: a training of its own length, and only the first so many seeds.
+RUN = ("steps", "seeds")
 GROUPS["all"] = [*PAPER, *GROUPS["guided"], *GROUPS["peers"], *GROUPS["sbx"], "linear"]
 
 
@@ -72,7 +74,14 @@ class Column:
     @property
     def changes(self) -> dict[str, Any]:
         """The overrides' values, by dotted name."""
-        return {key: yaml.safe_load(value) for key, value in self.overrides}
+        return {key: yaml.safe_load(value) for key, value in self.overrides if key not in RUN}
+
+    def of_run(self, name: str, default: int) -> int:
+        """The run's own steps or seeds, else the default."""
+        value = yaml.safe_load(dict(self.overrides).get(name, str(default)))
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"In the column {self.name}, {name} must be 1 or more, but is {value!r}.")
+        return value
 
 
 def parse_column(text: str) -> Column:

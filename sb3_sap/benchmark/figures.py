@@ -26,7 +26,9 @@ def figure_4(results: Results, folder: Path, command: str) -> None:
     write_csv(folder / "figure4a.csv", results.curve[["column", "seed", "step", "reward"]])
     episodes = with_averages(results.episodes)
     write_csv(folder / "figure4b.csv", episodes)
-    a = _lines(results.curve, results.names, "step", "reward", "training step", "reward, mean of the last 100 steps")
+    a = line_figure(
+        results.curve, results.names, "step", "reward", "training step", "reward, mean of the last 100 steps"
+    )
     write_figure(folder / "figure4a", a)
     write_figure(folder / "figure4b", _episodes_figure(episodes, results.names))
     parts = [
@@ -49,7 +51,7 @@ def figure_5(results: Results, folder: Path, command: str) -> None:
     curve = curve.astype({"accuracy": float, "lowest_accuracy": float})
     write_csv(folder / "figure5.csv", curve.drop(columns="reward"))
     names = [name for name in results.names if (curve["column"] == name).any()]
-    figure = _lines(curve, names, "step", "accuracy", "training step", "balanced validation accuracy of E")
+    figure = line_figure(curve, names, "step", "accuracy", "training step", "balanced validation accuracy of E")
     figure.axes[0].axhline(0.7, color="0.5", linestyle=":")
     write_figure(folder / "figure5", figure)
     parts = ["![Figure 5](figure5.svg)\n", BAND, "The dotted line is the 70 % above which α takes its full value.\n"]
@@ -81,7 +83,8 @@ def with_averages(episodes: pd.DataFrame) -> pd.DataFrame:
     return episodes.assign(episode=number, average_reward=average, lost=episodes["ended"].isin(LOST))
 
 
-def _lines(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: str, y_label: str) -> Figure:
+def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: str, y_label: str) -> Figure:
+    """A line for every column: ``y`` of its runs over ``x``, the interquartile mean and its band."""
     figure, axes = _axes(x_label, y_label)
     for number, name in enumerate(names):
         wide = table[table["column"] == name].pivot(index=x, columns="seed", values=y).dropna(how="all")

@@ -8,16 +8,21 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
+from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.columns import Column, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
+from sb3_sap.benchmark.tasks import task_settings
+from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.permissibility import resolve
 from sb3_sap.presets import preset
 from sb3_sap.settings import SettingsMixin, make_action_noise
 
 #: The class of each algorithm, imported only when it is needed.
 CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
+    "dqn": "stable_baselines3:DQN",
     "ddpg_ap_unbalanced": "sb3_sap.benchmark.ablated:DDPGAPUnbalanced",
     "ddpg_ap_proposed": "sb3_sap.benchmark.ablated:DDPGAPProposed",
     "td3": "stable_baselines3:TD3",
@@ -60,7 +65,11 @@ def settings_of(column: Column, simulator: str, steps: int) -> dict[str, Any]:
         known = set(base)
     else:
         known = set(inspect.signature(algorithm_class(column.algo)).parameters)
-        base = preset(column.preset, NAMESAKES.get(column.algo, column.algo), steps)
+        namesake = NAMESAKES.get(column.algo, column.algo)
+        if simulator in ENVIRONMENTS:
+            base = preset(column.preset, namesake, steps)
+        else:
+            base = task_settings(namesake, column.preset, simulator, known)
         if column.algo.startswith("sbx_"):
             base = _for_sbx(base)
     settings = copy.deepcopy(base)
@@ -92,7 +101,10 @@ def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> O
     arguments = copy.deepcopy(dict(settings))
     if isinstance(arguments.get("action_noise"), Mapping) and not issubclass(cls, SettingsMixin):
         arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
-    return cls("MlpPolicy", env, seed=seed, device="cpu", **arguments)
+    if "replay_buffer_class" in arguments:
+        arguments["replay_buffer_class"] = resolve(arguments["replay_buffer_class"], "replay_buffer_class")
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+    return cls(policy, env, seed=seed, device="cpu", **arguments)
 
 
 def _for_sbx(settings: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sb3_sap.benchmark.cells import Cell, read_result, write_result
 from sb3_sap.benchmark.columns import Column
 from sb3_sap.benchmark.process import run_in_own_process, stop_all
+from sb3_sap.evaluation import ENVIRONMENTS
 
 
 def missing_cells(grid: dict[Column, list[Cell]], folder: Path) -> list[tuple[str, Cell]]:
@@ -97,7 +98,10 @@ def _workers(backend: str, scheduler: str | None) -> Iterator[None]:
 
 def _told(name: str, cell: Cell, result: dict[str, Any]) -> str:
     last = [row for row in result["laps"]["data"] if row[0] == cell.checkpoints[-1]]
-    done, score = sum(row[2] for row in last), sum(row[5] for row in last) / len(last)
+    score = sum(row[5] for row in last) / len(last)
+    if cell.simulator not in ENVIRONMENTS:
+        return escape(f"{name}, seed {cell.seed}: mean return {score:.4g}")
+    done = sum(row[2] for row in last)
     return escape(f"{name}, seed {cell.seed}: {done} of {len(last)} laps, S {score:.3f}")
 
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_sap.benchmark.cells import Cell
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.linear import LinearFeedback
+from sb3_sap.benchmark.tasks import RETURN_COLUMNS, evaluation, make_env
 from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD
 from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env
 
@@ -96,9 +97,7 @@ class Recorder(BaseCallback):
         self._accuracies.append(getattr(self.model, "validation_accuracy", float("nan")))
         self._length, self._total = self._length + 1, self._total + reward
         if done:
-            lost = "off track" if info["off_track"] else "backwards"
-            other = "truncated" if info.get("TimeLimit.truncated") else "still"
-            self._end_episode(lost if reward == OFF_TRACK_REWARD else other)
+            self._end_episode(_how_ended(info, reward))
         if self.num_timesteps % INTERVAL == 0:
             self._point()
         return True
@@ -114,12 +113,43 @@ class Recorder(BaseCallback):
         self.curve.append([self.num_timesteps, round(sum(self._rewards) / len(self._rewards), 3), *accuracy])
 
 
+def _how_ended(info: dict[str, Any], reward: float) -> str:
+    if info.get("TimeLimit.truncated"):
+        return "truncated"
+    if "off_track" not in info:
+        return "terminated"
+    if reward != OFF_TRACK_REWARD:
+        return "still"
+    return "off track" if info["off_track"] else "backwards"
+
+
 def run_cell(cell: Cell, began: float) -> dict[str, Any]:
     """Trains, evaluates and returns the tables of the cell, as lists that JSON can hold.
 
     :param began: when the process was started, in ``time.monotonic`` seconds
     """
     clock = Clock(began)
+    if cell.simulator in ENVIRONMENTS:
+        evaluate, columns = _laps(cell), LAP_COLUMNS
+    else:
+        evaluate, columns = evaluation(cell.simulator, cell.algo, cell.training, cell.tracks), RETURN_COLUMNS
+    recorder = Recorder(cell.checkpoints, evaluate, clock)
+    if cell.algo == "linear":
+        recorder.laps = [[0, *row] for row in evaluate(LinearFeedback(**cell.settings))]
+    else:
+        env = make_env(ENVIRONMENTS.get(cell.simulator, cell.simulator), cell.training)
+        model = make_model(cell.algo, env, cell.settings, cell.seed)
+        model.learn(cell.steps, callback=recorder)
+    return {
+        "laps": {"columns": columns, "data": recorder.laps},
+        "times": {"columns": TIME_COLUMNS, "data": recorder.times},
+        "curve": {"columns": CURVE_COLUMNS, "data": recorder.curve},
+        "episodes": {"columns": EPISODE_COLUMNS, "data": recorder.episodes},
+    }
+
+
+def _laps(cell: Cell) -> Callable[[Any], list[list[Any]]]:
+    """A function that drives a lap of every test track: rows that follow the checkpoint in ``LAP_COLUMNS``."""
     tests: dict[str, gym.Env[Any, Any]] = {}
 
     def evaluate(policy: Any) -> list[list[Any]]:
@@ -131,16 +161,4 @@ def run_cell(cell: Cell, began: float) -> dict[str, Any]:
             for r in driven
         ]
 
-    recorder = Recorder(cell.checkpoints, evaluate, clock)
-    if cell.algo == "linear":
-        recorder.laps = [[0, *row] for row in evaluate(LinearFeedback(**cell.settings))]
-    else:
-        env = gym.make(ENVIRONMENTS[cell.simulator], **cell.training)
-        model = make_model(cell.algo, env, cell.settings, cell.seed)
-        model.learn(cell.steps, callback=recorder)
-    return {
-        "laps": {"columns": LAP_COLUMNS, "data": recorder.laps},
-        "times": {"columns": TIME_COLUMNS, "data": recorder.times},
-        "curve": {"columns": CURVE_COLUMNS, "data": recorder.curve},
-        "episodes": {"columns": EPISODE_COLUMNS, "data": recorder.episodes},
-    }
+    return evaluate

@@ -16,6 +16,7 @@ from rl_zoo3 import ALGOS
 from sb3_sap.errors import nearest
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import RUNNER_KEYS, algorithms
+from sb3_sap.settings import LINEAR
 
 #: What the words of an annotation admit. An annotation with any other word is left to the constructor.
 KINDS: dict[str, tuple[type, ...]] = {
@@ -27,7 +28,7 @@ KINDS: dict[str, tuple[type, ...]] = {
 }
 #: Given by name in YAML: classes and functions.
 DOTTED = ("env_wrapper", "vec_env_wrapper", "callback")
-#: rl_zoo3 makes a schedule of numbers and of "lin_0.001".
+#: May be "lin_0.001": rl_zoo3 makes a schedule of the first, our constructors of all.
 SCHEDULES = ("learning_rate", "actor_learning_rate", "actor_permissibility_coef")
 
 
@@ -85,7 +86,7 @@ def check_hyperparameters(algo: str, hyperparams: Mapping[str, Any], source: str
 
 def _check_type(key: str, value: Any, parameter: inspect.Parameter, source: str) -> None:
     if key in SCHEDULES:
-        if isinstance(value, str) and not re.fullmatch(r"lin_[0-9.]+(e-?\d+)?", value):
+        if isinstance(value, str) and not re.fullmatch(LINEAR, value):
             raise TypeError(f'{source}: `{key}` must be a number or "lin_<number>", but is {value!r}.{_dot(value)}')
         return
     annotation = parameter.annotation

@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sap.exploration import ActionPermissibilityMixin
-from sb3_sap.zoo.configs import SCHEDULES, check_file, check_hyperparameters, packaged
+from sb3_sap.zoo.configs import check_file, check_hyperparameters, packaged
 from sb3_sap.zoo.storages import SeededByTrial, check_belongs, load_study
 
 
@@ -77,16 +77,6 @@ class GuidedExperimentManager(ExperimentManager):
             raise ValueError(f"`--trial-id` {number} is none of the {len(trials)} trials of the study {study_name!r}.")
         params = trials[number].params
         return HYPERPARAMS_CONVERTER[self.algo](params) if convert else params
-
-    @staticmethod
-    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
-        # It knows the schedules of SB3's own algorithms alone.
-        hyperparams = ExperimentManager._preprocess_schedules(hyperparams)
-        for key in SCHEDULES:
-            if isinstance(hyperparams.get(key), str):
-                schedule = ExperimentManager._preprocess_schedules({"learning_rate": hyperparams[key]})
-                hyperparams[key] = schedule["learning_rate"]
-        return hyperparams
 
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]

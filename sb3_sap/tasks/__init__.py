@@ -1,0 +1,20 @@
+"""AP functions of well-known environments beyond lane keeping, each with its argument, or said to be a heuristic.
+
+Any of them is given to a guided algorithm by its name, ``ap_function="sb3_sap.tasks.mountain_car_continuous"``. They
+use what the environments return by default, unless their docstring names an option.
+"""
+
+from sb3_sap.tasks.driving import parking, racetrack
+from sb3_sap.tasks.energy import acrobot, mountain_car, mountain_car_continuous
+from sb3_sap.tasks.pendulum import pendulum_energy, pendulum_height, pendulum_torque
+
+__all__ = [
+    "acrobot",
+    "mountain_car",
+    "mountain_car_continuous",
+    "parking",
+    "pendulum_energy",
+    "pendulum_height",
+    "pendulum_torque",
+    "racetrack",
+]

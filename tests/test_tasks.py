@@ -1,0 +1,204 @@
+"""AP functions beyond lane keeping, on transitions computed by hand and on the environments' own dynamics."""
+
+import gymnasium as gym
+import highway_env  # noqa: F401  registers its environments
+import numpy as np
+import pytest
+
+from sb3_sap import tasks
+from sb3_sap.permissibility import resolve
+from sb3_sap.presets import algorithms, load_config
+from sb3_sap.tasks.driving import FAR, MISS_DISTANCE, least_distance, leaving_speed
+from sb3_sap.tasks.energy import acrobot_energy, flag_within_reach
+from sb3_sap.tasks.pendulum import energy as pendulum_energy_of
+
+
+def rows(*values):
+    return np.array(values, dtype=np.float32)
+
+
+# ------------------------------------------------------------------ mountain cars
+
+
+def test_the_motor_must_not_push_against_the_motion():
+    obs = rows([-0.5, 0.02], [-0.5, 0.02], [-0.5, -0.02], [-0.5, -0.02], [-0.5, 0.02])
+    push = rows([1.0], [-1.0], [1.0], [-0.1], [0.0])
+    expected = [True, False, False, True, True]
+    assert tasks.mountain_car_continuous(obs, push, obs).tolist() == expected
+    actions = np.array([2, 0, 2, 0, 1])
+    assert tasks.mountain_car(obs, actions, obs).tolist() == expected
+    assert tasks.mountain_car(obs, actions[:, None], obs).tolist() == expected
+
+
+def test_where_the_car_turns_either_push_is_permissible():
+    before, after = rows([-0.9, -0.001]), rows([-0.9, 0.001])
+    for push in (-1.0, 1.0):
+        assert tasks.mountain_car_continuous(before, rows([push]), after).tolist() == [True]
+    start = rows([-0.5, 0.0])
+    assert tasks.mountain_car_continuous(start, rows([1.0]), rows([-0.499, 0.001])).tolist() == [True]
+
+
+def test_with_enough_energy_the_car_may_turn_at_once():
+    # Moving left up the left hill, pushing right.
+    slow, fast = rows([-0.6, -0.01]), rows([-0.9, -0.04])
+    assert flag_within_reach(np.concatenate([slow, fast])).tolist() == [False, True]
+    assert tasks.mountain_car(slow, np.array([2]), slow).tolist() == [False]
+    assert tasks.mountain_car(fast, np.array([2]), fast).tolist() == [True]
+
+
+def test_within_reach_means_that_pushing_right_gets_there():
+    env = gym.make("MountainCar-v0").unwrapped
+    rng = np.random.default_rng(0)
+    states = np.column_stack([rng.uniform(-1.2, 0.4, 300), rng.uniform(-0.07, 0.07, 300)])
+    arrives = []
+    for state in states:
+        env.reset(seed=0)
+        env.state = tuple(state)
+        # A car that turns back to the left has missed it.
+        obs, _, done, _, _ = env.step(2)
+        turned = obs[1] > 0
+        while not done and not (turned and obs[1] < 0):
+            obs, _, done, _, _ = env.step(2)
+            turned |= obs[1] > 0
+        arrives.append(done)
+    assert 50 < sum(arrives) < 250
+    # Gymnasium takes steps, not infinitely small ones: at the very edge the sum may err.
+    assert np.mean(flag_within_reach(states) == arrives) > 0.97
+
+
+# ------------------------------------------------------------------ acrobot
+
+
+def test_energy_of_the_acrobot():
+    hanging, upright = [1, 0, 1, 0, 0, 0], [-1, 0, 1, 0, 0, 0]
+    folded = [1, 0, -1, 0, 0, 0]  # the second link points up again
+    assert acrobot_energy(rows(hanging, upright, folded)) == pytest.approx(9.8 * np.array([-2, 2, -1]))
+    # The second link alone turns at 2 rad/s: at its centre 1 m/s, 1 kg and 1 kg·m².
+    assert acrobot_energy(rows([1, 0, 1, 0, 0, 2])) == pytest.approx([-19.6 + 0.5 + 2.0])
+
+
+def test_energy_of_the_acrobot_is_that_of_the_environment():
+    env = gym.make("Acrobot-v1").unwrapped
+    env.reset(seed=0)
+    env.state = np.array([1.0, -0.5, 0.8, -1.2])
+    energies = []
+    for _ in range(20):
+        energies.append(acrobot_energy(env._get_ob()[None])[0])
+        env.step(1)
+    assert np.ptp(energies) < 0.05  # without torque it is kept
+
+
+def test_the_torque_must_not_brake_its_joint():
+    obs = rows([1, 0, 1, 0, 0, 1.0])
+    assert [bool(tasks.acrobot(obs, np.array([a]), obs)[0]) for a in (0, 1, 2)] == [False, True, True]
+    turning = rows([1, 0, 1, 0, 0, -1.0])
+    assert bool(tasks.acrobot(obs, np.array([0]), turning)[0])
+    swinging = rows([1, 0, 1, 0, 5.0, 1.0])  # 12.5·(0.25 + 1 + 1) + … > 4.9 + 19.6 J above hanging
+    assert bool(tasks.acrobot(swinging, np.array([0]), swinging)[0])
+
+
+# ------------------------------------------------------------------ pendulum
+
+
+def test_the_pendulum_s_three():
+    level, higher = rows([0.0, 1.0, -1.0]), rows([0.1, 0.99, -1.0])
+    assert tasks.pendulum_height(level, rows([0.0]), higher).tolist() == [True]
+    assert tasks.pendulum_height(higher, rows([0.0]), level).tolist() == [False]
+    # θ > 0: torque towards the top is negative.
+    assert tasks.pendulum_torque(level, rows([-1.0]), level).tolist() == [True]
+    assert tasks.pendulum_torque(level, rows([1.0]), level).tolist() == [False]
+    # Falling at 1 rad/s from level there is energy missing: drive on, do not brake.
+    falling = rows([0.0, 1.0, 1.0])
+    assert tasks.pendulum_energy(falling, rows([1.0]), falling).tolist() == [True]
+    assert tasks.pendulum_energy(falling, rows([-1.0]), falling).tolist() == [False]
+    # At 6 rad/s there is too much.
+    racing = rows([0.0, 1.0, 6.0])
+    assert tasks.pendulum_energy(racing, rows([1.0]), racing).tolist() == [False]
+    assert tasks.pendulum_energy(racing, rows([-1.0]), racing).tolist() == [True]
+    assert pendulum_energy_of(rows([1, 0, 0], [-1, 0, 0], [0, 1, 2])) == pytest.approx([0, -30, -13])
+
+
+# ------------------------------------------------------------------ driving
+
+
+def parked(x, y, vx, vy, goal=(0.3, 0.0)):
+    return {"achieved_goal": rows([x, y, vx, vy, 1, 0]), "desired_goal": rows([*goal, 0, 0, 0, 1])}
+
+
+def test_parking():
+    assert leaving_speed(parked(0, 0, 1, 1)) == pytest.approx([-1.0])
+    away, faster, back = parked(0, 0, -0.5, 0), parked(0, 0, -1, 0), parked(0, 0, 0.5, 0)
+    assert tasks.parking(away, None, faster).tolist() == [False]
+    assert tasks.parking(faster, None, away).tolist() == [True]  # it brakes
+    assert tasks.parking(back, None, back).tolist() == [True]
+    near, near_faster = parked(0.25, 0, -0.5, 0), parked(0.25, 0, -1, 0)
+    assert tasks.parking(near, None, near_faster).tolist() == [True]
+
+
+def on_the_track(lat=0.0, *others):
+    """An observation with up to two other cars, (x, y, vx, vy) relative to the first in m and m/s."""
+    obs = np.zeros((1, 3, 9), dtype=np.float32)
+    obs[0, 0, [0, 7]] = 1, lat / 2.5
+    for row, other in enumerate(others, 1):
+        obs[0, row, 0] = 1
+        obs[0, row, 1:5] = np.array(other) / FAR
+    return obs
+
+
+def test_least_distance():
+    assert least_distance(on_the_track()) == pytest.approx([np.inf])
+    # 20 m ahead, 10 m/s slower: met in 2 s, 3 m to the side.
+    assert FAR * least_distance(on_the_track(0, (20, 3, -10, 0))) == pytest.approx([3.0])
+    # 3 s later it is still 10 m off.
+    assert FAR * least_distance(on_the_track(0, (40, 0, -10, 0))) == pytest.approx([10.0])
+    # It drives away: the least distance is now. The nearer of two counts.
+    assert FAR * least_distance(on_the_track(0, (20, 0, 10, 0), (7, 0, 1, 0))) == pytest.approx([7.0])
+
+
+def test_racetrack():
+    assert 2 < MISS_DISTANCE * FAR < 5
+    hit, graze, clear = (on_the_track(0, (10, side, -10, 0)) for side in (0, 2, 4))
+    assert tasks.racetrack(graze, None, hit).tolist() == [False]
+    assert tasks.racetrack(hit, None, graze).tolist() == [True]
+    assert tasks.racetrack(clear, None, graze).tolist() == [False]
+    # Without a collision course it is lane keeping; on one, the lane does not matter.
+    assert tasks.racetrack(on_the_track(0.5), None, on_the_track(1.0)).tolist() == [False]
+    assert tasks.racetrack(on_the_track(1.0), None, on_the_track(0.5)).tolist() == [True]
+    assert tasks.racetrack(on_the_track(0.0), None, on_the_track(0.2)).tolist() == [True]
+    graze[0, 0, 7] = 0.9
+    assert tasks.racetrack(hit, None, graze).tolist() == [True]
+
+
+# ------------------------------------------------------------------ as they are used
+
+ENTRIES = [
+    (algo, env_id, entry)
+    for algo in algorithms()
+    for env_id, entry in load_config(algo).items()
+    if str(entry.get("ap_function", "")).startswith("sb3_sap.tasks.")
+]
+
+
+@pytest.mark.parametrize(("algo", "env_id", "entry"), ENTRIES, ids=[f"{a}-{e}" for a, e, _ in ENTRIES])
+def test_every_entry_labels_what_its_environment_returns(algo, env_id, entry):
+    env = gym.make(env_id, **entry.get("env_kwargs", {}))
+    env.action_space.seed(0)
+    transitions = []
+    obs, _ = env.reset(seed=0)
+    for _ in range(60):
+        action = env.action_space.sample()
+        next_obs, _, terminated, truncated, _ = env.step(action)
+        transitions.append((obs, np.asarray(action), next_obs))
+        obs = env.reset()[0] if terminated or truncated else next_obs
+
+    def batch(values):
+        return (
+            {key: np.stack([v[key] for v in values]) for key in values[0]}
+            if isinstance(values[0], dict)
+            else (np.stack(values))
+        )
+
+    labels = resolve(entry["ap_function"], "ap_function")(*map(batch, zip(*transitions, strict=True)))
+    assert labels.shape == (60,)
+    assert labels.dtype == bool
+    assert 0 < labels.sum() < 60

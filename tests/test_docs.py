@@ -157,7 +157,7 @@ def test_every_algorithm_has_its_row():
 #: The constants at the top of each notebook, cut to what shows that its cells run; 01 runs as it is.
 NOTEBOOKS = {
     "01_action_permissibility": {},
-    "02_lane_keeping": {"STEPS": 300, "TEST_TRACKS": ["g-track-3"]},
+    "02_lane_keeping": {"STEPS": 800, "TEST_TRACKS": ["g-track-3"]},
     "03_your_own_problem": {"STEPS": 1_200, "TRIALS": 2},
 }
 

@@ -76,7 +76,7 @@ def test_train_leaves_what_rl_zoo_leaves():
         path.name for path in run.iterdir()
     }
     model = DDPGAP.load(run / f"{FOLDER}.zip")
-    assert (model.alpha, model.t_k, model.seed, model.num_timesteps) == (0.7, 150, 3, 60)
+    assert (model.alpha, model.refit_growth, model.seed, model.num_timesteps) == (0.7, 0.005, 3, 60)
     assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [30, 60]
     saved, _ = rl_zoo3.get_saved_hyperparams(str(run / FOLDER))
     assert saved["alpha"] == 0.7

@@ -29,7 +29,7 @@ def synthetic(cell, accuracy=0.8):
     early, late = SCORES.get(cell.algo, (0.9, 0.9))
     laps, times = [], []
     for point in cell.checkpoints:
-        score = (0 if point < 250 else early if point < 500 else late) + cell.seed / 500
+        score = (0 if 0 < point < 250 else early if point < 500 else late) + cell.seed / 500
         laps += [[point, track, score > 0.4, min(score * 2, 1), 1000 * score, score, 10] for track in cell.tracks]
         times.append([point, 4 + point / 100, point / 100, point / 100])
     guided = "_ap" in cell.algo

@@ -124,7 +124,7 @@ def test_returns_of_policies_that_can_be_computed_in_the_head():
         assert row["steps"] < 150
         assert row["permissible"] == 1.0
     idle = rows_of(lambda obs: np.zeros((len(obs), 1)))
-    assert [row["permissible"] for row in idle] == [1.0, 1.0]
+    assert [row["permissible"] for row in idle] == [0.0, 0.0]
 
 
 def test_episodes_run_side_by_side_as_they_would_alone():

@@ -22,9 +22,8 @@ def rows(*values):
 
 def test_the_motor_must_not_push_against_the_motion():
     obs = rows([-0.5, 0.02], [-0.5, 0.02], [-0.5, -0.02], [-0.5, -0.02], [-0.5, 0.02])
-    push = rows([1.0], [-1.0], [1.0], [-0.1], [0.0])
-    expected = [True, False, False, True, True]
-    assert tasks.mountain_car_continuous(obs, push, obs).tolist() == expected
+    expected = [True, False, False, True, False]
+    assert tasks.mountain_car_continuous(obs, rows([1.0], [-1.0], [1.0], [-0.2], [0.05]), obs).tolist() == expected
     actions = np.array([2, 0, 2, 0, 1])
     assert tasks.mountain_car(obs, actions, obs).tolist() == expected
     assert tasks.mountain_car(obs, actions[:, None], obs).tolist() == expected
@@ -34,8 +33,16 @@ def test_where_the_car_turns_either_push_is_permissible():
     before, after = rows([-0.9, -0.001]), rows([-0.9, 0.001])
     for push in (-1.0, 1.0):
         assert tasks.mountain_car_continuous(before, rows([push]), after).tolist() == [True]
+    assert tasks.mountain_car(np.repeat(before, 2, 0), np.array([0, 2]), np.repeat(after, 2, 0)).tolist() == [True] * 2
     start = rows([-0.5, 0.0])
     assert tasks.mountain_car_continuous(start, rows([1.0]), rows([-0.499, 0.001])).tolist() == [True]
+
+
+def test_idling_delays_the_flag():
+    obs = rows([-0.5, 0.02], [-0.5, 0.02], [-0.5, -0.02], [-0.5, 0.0])
+    push = rows([0.0], [0.05], [-0.05], [0.0])
+    assert tasks.mountain_car_continuous(obs, push, obs).tolist() == [False] * 4
+    assert tasks.mountain_car(obs, np.array([1, 1, 1, 1]), obs).tolist() == [False] * 4
 
 
 def test_with_enough_energy_the_car_may_turn_at_once():
@@ -90,7 +97,7 @@ def test_energy_of_the_acrobot_is_that_of_the_environment():
 
 def test_the_torque_must_not_brake_its_joint():
     obs = rows([1, 0, 1, 0, 0, 1.0])
-    assert [bool(tasks.acrobot(obs, np.array([a]), obs)[0]) for a in (0, 1, 2)] == [False, True, True]
+    assert [bool(tasks.acrobot(obs, np.array([a]), obs)[0]) for a in (0, 1, 2)] == [False, False, True]
     turning = rows([1, 0, 1, 0, 0, -1.0])
     assert bool(tasks.acrobot(obs, np.array([0]), turning)[0])
     swinging = rows([1, 0, 1, 0, 5.0, 1.0])  # 12.5·(0.25 + 1 + 1) + … > 4.9 + 19.6 J above hanging

@@ -177,7 +177,11 @@ def test_killed_and_started_again(tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_stops_the_cells_too(tmp_path):
     running = subprocess.Popen(
-        command(tmp_path, "--steps", "100000"), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        command(tmp_path, "--steps", "100000"),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        # A script's background jobs, and with them these tests, may have been told to ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     wait_for(lambda: living_children(running.pid))
     [child] = living_children(running.pid)

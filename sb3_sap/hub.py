@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,20 +68,21 @@ class Trained:
 def find_trained(path: Path, algo: str | None, env_id: str | None, command: str | None) -> Trained:
     """Reads what a run left; what is given takes the place of what is found.
 
-    :param path: the output folder of ``sb3-sap demo``, or the .zip of any model of this package
+    :param path: the output folder of ``sb3-sap demo`` or of ``sb3-sap train``, or the .zip of any model of this package
     :raise FileNotFoundError: if there is no model
-    :raise ValueError: if something is neither found nor given
+    :raise ValueError: if something is neither found nor given, or the model wants normalised observations
     """
     from sb3_sap.algorithms import ALGORITHMS
 
-    model = path / "model.zip" if path.is_dir() else path
+    zoo = _zoo_run(path)
+    model = path / zoo.get("model", "model.zip") if path.is_dir() else path
     if not model.is_file():
-        raise FileNotFoundError(f"There is no model {model}: give the output folder of the demo, or a model's .zip.")
-    run, laps = _read_json(model.with_name("run.json"), {}), _read_json(model.with_name("evaluation.json"), [])
+        raise FileNotFoundError(f"There is no model {model}: give the output folder of a run, or a model's .zip.")
+    run, laps = zoo | _read_json(model.with_name("run.json"), {}), _read_json(model.with_name("evaluation.json"), [])
     simulator = run.get("simulator")
     given: dict[str, Any] = {
         "algo": algo or run.get("algo"),
-        "env": env_id or (ENVIRONMENTS[simulator] if simulator else None),
+        "env": env_id or (ENVIRONMENTS[simulator] if simulator else run.get("env")),
         "command": command or run.get("command"),
     }
     missing = [f"--{name}" for name, value in given.items() if not value]
@@ -89,6 +91,28 @@ def find_trained(path: Path, algo: str | None, env_id: str | None, command: str 
     if given["algo"] not in ALGORITHMS:
         raise ValueError(f"--algo {given['algo']!r} is unknown: {nearest(given['algo'], ALGORITHMS)}")
     return Trained(model, given["algo"], given["env"], given["command"], tuple(laps))
+
+
+def _zoo_run(folder: Path) -> dict[str, str]:
+    """What RL Zoo's training says of itself in `ENV_ID/command.txt`: model, algo, env and command, or nothing."""
+    found = next(folder.glob("*/command.txt"), None)
+    if found is None:
+        return {}
+    if found.with_name("vecnormalize.pkl").is_file():
+        raise ValueError(
+            f"{folder} normalises observations, which the model file does not hold: publish it with RL Zoo's own "
+            "command, python -m rl_zoo3.push_to_hub."
+        )
+    words = found.read_text(encoding="utf-8").split()  # RL Zoo joins its arguments without quotes
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("--env")
+    named, _ = parser.parse_known_args(words)
+    # without the folders of the machine: `python /…/bin/sb3-sap train …`, or `python -m sb3_sap.zoo train …`
+    words[:2] = ["python", "-m"] if words[1] == "-m" else [Path(words[1]).name]
+    best = folder / "best_model.zip"
+    model = best.name if best.is_file() else f"{found.parent.name}.zip"
+    return {"model": model, "algo": named.algo, "env": named.env, "command": shlex.join(words)}
 
 
 def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) -> list[Path]:
@@ -183,7 +207,7 @@ def add_push_to_hub(commands: argparse._SubParsersAction[argparse.ArgumentParser
         description="Writes a model card with results and the command of the run, and uploads both with the model, by "
         "SB3's own integration. Log in beforehand with `hf auth login`, or set HF_TOKEN.",
     )
-    command.add_argument("path", type=Path, help="the output folder of `sb3-sap demo`, or a model's .zip")
+    command.add_argument("path", type=Path, help="the output folder of `sb3-sap demo` or `train`, or a model's .zip")
     command.add_argument("--repo-id", required=True, help="repository on the Hub, such as YOU/ddpg_ap-LaneKeeping")
     command.add_argument("--algo", help="the algorithm, where the folder does not say it")
     command.add_argument("--env", help="the environment's id, the same")

@@ -71,6 +71,42 @@ def test_the_card_tells_results_command_and_use(run, uploads):
     assert 'DDPGAP.load(load_from_hub("me/car", "ddpg_ap-sap-TorcsLaneKeeping-v0.zip"))' in card.text
 
 
+@pytest.fixture
+def zoo_run(tmp_path):
+    """What `sb3-sap train` leaves."""
+    from stable_baselines3 import DDPG
+
+    folder = tmp_path / "Pendulum-v1_1"
+    (folder / "Pendulum-v1").mkdir(parents=True)
+    DDPG("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(folder / "Pendulum-v1")
+    (folder / "Pendulum-v1" / "command.txt").write_text(
+        "/home/me/bin/python3 /home/me/bin/sb3-sap train --algo=ddpg --env Pendulum-v1 "
+        "-params gamma:0.9 policy_kwargs:dict(net_arch=[4])"
+    )
+    return folder
+
+
+def test_a_run_of_the_zoo_says_everything_by_itself(zoo_run):
+    assert push(zoo_run, "--repo-id", "me/p", "--dry-run", "--episodes", 1) == 0
+    card = ModelCard.load(zoo_run / "hub" / "README.md")
+    assert card.data.eval_results[0].dataset_name == "Pendulum-v1"
+    command = "sb3-sap train --algo=ddpg --env Pendulum-v1 -params gamma:0.9 'policy_kwargs:dict(net_arch=[4])'"
+    assert f"```\n{command}\n```" in card.text
+    assert "/home/me" not in card.text
+    assert (zoo_run / "hub" / "ddpg-Pendulum-v1.zip").is_file()
+
+
+def test_the_best_model_of_a_zoo_run_goes_first(zoo_run):
+    (zoo_run / "Pendulum-v1.zip").rename(zoo_run / "best_model.zip")
+    assert push(zoo_run, "--repo-id", "me/p", "--dry-run", "--episodes", 1) == 0
+
+
+def test_a_model_that_wants_normalised_observations_is_refused(zoo_run, capsys):
+    (zoo_run / "Pendulum-v1" / "vecnormalize.pkl").touch()
+    assert push(zoo_run, "--repo-id", "me/p", "--dry-run") == 1
+    assert "rl_zoo3.push_to_hub" in capsys.readouterr().err
+
+
 def test_any_other_model_is_evaluated(tmp_path, uploads):
     from stable_baselines3 import DDPG
 

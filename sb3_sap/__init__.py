@@ -30,6 +30,7 @@ from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import ActionPermissibility
 from sb3_sap.prediction import GuidedPolicy
 from sb3_sap.predictor import PermissibilityPredictor
+from sb3_sap.presets import preset
 
 __version__ = "0.1.0"
 __all__ = [
@@ -60,4 +61,5 @@ __all__ = [
     "PermissibilityReport",
     "check_permissibility",
     "envs",
+    "preset",
 ]

@@ -148,6 +148,7 @@ def test_watching_needs_no_buffers(tmp_path):
         (["--trial-id", "0"], "give `--storage` and `--study-name`"),
         (["--validation-tracks", "eroad"], "one of the paper's test tracks"),
         (["--algo", "ddpg", "--guidance-only"], "which ddpg has not"),
+        (["-optimize", "--sampler", "auto"], "OptunaHub, over the network, and optunahub is missing"),
         (["--storage", "study.sqlite", "--study-name", "x", "--trial-id", "0"], "neither a database URL"),
         (["--storage", "sqlite:///empty.db", "--study-name", "x", "--trial-id", "0"], "There is no study 'x'"),
         (["--storage", "sqlite:////no/folder/x.db", "--study-name", "x", "--trial-id", "0"], "cannot be opened"),

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import runpy
 import shlex
-import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import rl_zoo3.enjoy
 import rl_zoo3.train
 import rl_zoo3.utils
 
-from sb3_sap.errors import nearest
+from sb3_sap.zoo.arguments import NamedStoreDict, command_line
 from sb3_sap.zoo.configs import check_algo
 from sb3_sap.zoo.options import StudyOptions, study_parser
+from sb3_sap.zoo.plotting import plot
 from sb3_sap.zoo.registration import register, small_buffers
-from sb3_sap.zoo.report import write_report_to
 from sb3_sap.zoo.retest import RetestManager
 from sb3_sap.zoo.storages import load_study
 from sb3_sap.zoo.tuning import StudyManager
@@ -29,7 +26,6 @@ DEFAULT_ALGO = "ddpg_ap"
 LOGS = "logs"
 #: Base seeds where `--seed` is missing. Studies stay clear of the benchmark's seeds, and fresh seeds of a study's.
 SEEDS = {"optimize": 100, "retest": 10_000}
-PLOTS = ("train", "all", "file", "study")
 
 
 def run(arguments: list[str]) -> int:
@@ -59,7 +55,7 @@ def _train(command: str, arguments: list[str]) -> None:
     options = StudyOptions(**vars(own), command=shlex.join(["sb3-sap", command, *arguments]))
     zoo: Any = rl_zoo3.train
     zoo.ExperimentManager, zoo.StoreDict = partial(manager, options=options), NamedStoreDict
-    with _argv(command, rest):
+    with command_line(command, rest):
         zoo.train()
 
 
@@ -94,77 +90,11 @@ def _watch(command: str, arguments: list[str]) -> None:
         arguments = [*arguments, "-f", LOGS]  # where `train` leaves its runs; rl_zoo3's own agents are elsewhere
     zoo: Any = rl_zoo3.enjoy
     zoo.StoreDict = rl_zoo3.utils.StoreDict = NamedStoreDict  # type: ignore[misc]
-    with small_buffers(), _argv(command, arguments):
+    with small_buffers(), command_line(command, arguments):
         if command == "enjoy":
             zoo.enjoy()
         else:
             runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
-
-
-def _plot(command: str, arguments: list[str]) -> None:
-    if not arguments or arguments[0] not in PLOTS:
-        raise ValueError(f"`plot` needs to know what: {nearest(arguments[0] if arguments else '', PLOTS)}")
-    what, rest = arguments[0], arguments[1:]
-    parser = ArgumentParser(prog=f"sb3-sap plot {what}", add_help=what == "study", allow_abbrev=False)
-    if what == "study":
-        parser.add_argument("--storage", required=True, help="where the study is kept")
-        parser.add_argument("--study-name", required=True, help="its name")
-        parser.add_argument("--out", type=Path, default=Path("report"), help="folder of the report")
-        options = parser.parse_args(rest)
-        print(f"The report is in {write_report_to(load_study(options.storage, options.study_name), options.out)}")
-        return
-    parser.add_argument("--save-figures", type=Path, metavar="FOLDER", help="write the figures as PNG, open no window")
-    own, rest = parser.parse_known_args(rest)
-    if {"-h", "--help"} & set(rest):
-        parser.print_help()
-    _rl_zoo3_plot(what, rest, own.save_figures)
-
-
-def _rl_zoo3_plot(what: str, arguments: list[str], folder: Path | None) -> None:
-    import matplotlib
-
-    if folder:
-        matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from rl_zoo3.plots import all_plots, plot_from_file, plot_train
-
-    from sb3_sap.plots import save
-
-    if folder:
-        plt.show = lambda *args, **kwargs: None
-    with _argv(f"plot {what}", arguments):
-        plots: dict[str, Any] = {"train": plot_train, "all": all_plots, "file": plot_from_file}
-        plots[what]()
-    for number in plt.get_fignums() if folder else []:
-        save(plt.figure(number), folder / f"{what}_{number}.png")  # type: ignore[operator]
-
-
-#: rl_zoo3's own; ours takes its name there.
-STORE_DICT: Any = rl_zoo3.utils.StoreDict
-
-
-class NamedStoreDict(STORE_DICT):  # type: ignore[misc]
-    """``key:value`` pairs whose values are Python; says which one is not."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
-        for pair in values:
-            key, colon, value = pair.partition(":")
-            try:
-                super().__call__(parser, namespace, [pair], option_string)
-            except Exception as error:
-                quoted = f"{key}:\"'{value}'\"" if colon else "alpha:0.7"
-                parser.error(f"{option_string} {pair}: {value!r} is no Python ({error}); write it like {quoted}")
-        super().__call__(parser, namespace, values, option_string)
-
-
-@contextmanager
-def _argv(command: str, arguments: list[str]) -> Iterator[None]:
-    # rl_zoo3 reads the command line from here and nowhere else.
-    before, sys.argv = sys.argv, [f"sb3-sap {command}", *arguments]
-    try:
-        yield
-    finally:
-        sys.argv = before
 
 
 RUNNERS: dict[str, Callable[[str, list[str]], None]] = {
@@ -173,5 +103,5 @@ RUNNERS: dict[str, Callable[[str, list[str]], None]] = {
     "retest": _train,
     "enjoy": _watch,
     "record-video": _watch,
-    "plot": _plot,
+    "plot": plot,
 }

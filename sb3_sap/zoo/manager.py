@@ -118,7 +118,13 @@ class GuidedExperimentManager(ExperimentManager):
     def _create_sampler(self, sampler_method: str) -> optuna.samplers.BaseSampler:
         # Workers that share a seed would all try the same hyperparameters first.
         if sampler_method == "auto":
-            return super()._create_sampler(sampler_method)
+            try:
+                return super()._create_sampler(sampler_method)
+            except ModuleNotFoundError as error:
+                raise ValueError(
+                    f"`--sampler auto` comes from OptunaHub, over the network, and {error.name} is missing: "
+                    "pip install optunahub cmaes, or choose tpe or random."
+                ) from error
 
         def make(seed: int) -> optuna.samplers.BaseSampler:
             manager = copy.copy(self)

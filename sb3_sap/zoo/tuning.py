@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import platform
-import time
 from pprint import pformat
 from typing import Any
 
@@ -13,7 +12,6 @@ import numpy as np
 import optuna
 from huggingface_sb3 import EnvironmentName
 from optuna.pruners import BasePruner, MedianPruner, SuccessiveHalvingPruner
-from optuna.trial import TrialState
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_callback_list
@@ -28,14 +26,8 @@ from sb3_sap.zoo.options import StudyOptions, check_validation_tracks
 from sb3_sap.zoo.report import write_report
 from sb3_sap.zoo.reporting import ReportingCallback
 from sb3_sap.zoo.spaces import t_k_range
-from sb3_sap.zoo.storages import FINISHED, LIVE, check_belongs, is_surplus, open_storage, reap, without_password
-
-#: s between two looks at the trials of other workers.
-POLL = 2.0
-
-
-class SurplusTrial(Exception):
-    """Another worker began the last trial of the study at the same moment."""
+from sb3_sap.zoo.storages import check_belongs, is_surplus, open_storage, without_password
+from sb3_sap.zoo.workers import SurplusTrial, work_until
 
 
 class StudyManager(GuidedExperimentManager):
@@ -153,7 +145,7 @@ class StudyManager(GuidedExperimentManager):
             if self.max_total_trials is None:
                 study.optimize(self.objective, n_trials=self.n_trials, n_jobs=self.n_jobs, gc_after_trial=True)
             else:
-                self._work_until(study, self.max_total_trials)
+                work_until(study, self.objective, self.max_total_trials, self.n_jobs)
         except KeyboardInterrupt:
             print("Interrupted: the trials that are finished stay in the study.")
         folder = write_report(study, self.log_folder, self.algo, self.env_name, pictures=not self.no_optim_plots)
@@ -170,25 +162,3 @@ class StudyManager(GuidedExperimentManager):
         study.set_user_attr("n_timesteps", self.n_timesteps)
         study.set_user_attr("validation_tracks", self.options.validation_tracks)
         study.set_user_attr("hyperparams", {key: str(value) for key, value in sorted(self._hyperparams.items())})
-
-    def _work_until(self, study: optuna.Study, max_total_trials: int) -> None:
-        """Runs trials until that many are finished, by whichever worker; those of workers that died are run again."""
-        told = False
-        while True:
-            reap(study)
-            trials = study.get_trials(deepcopy=False, states=LIVE)
-            if sum(trial.state in FINISHED for trial in trials) >= max_total_trials:
-                return
-            waiting = any(trial.state == TrialState.WAITING for trial in trials)
-            if waiting or len(trials) < max_total_trials:
-                missing = max(1, max_total_trials - len(trials))
-                n_jobs = min(self.n_jobs if self.n_jobs > 0 else missing, missing)
-                study.optimize(
-                    self.objective, n_trials=n_jobs, n_jobs=n_jobs, catch=(SurplusTrial,), gc_after_trial=True
-                )
-                continue
-            if not told:
-                told = True
-                running = [trial.number for trial in trials if trial.state == TrialState.RUNNING]
-                print(f"Waiting for trials {running} of other workers, in case one of them dies.")
-            time.sleep(POLL)

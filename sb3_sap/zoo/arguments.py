@@ -1,0 +1,37 @@
+"""rl_zoo3's command line: read from ``sys.argv`` alone, its values Python."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import rl_zoo3.utils
+
+#: rl_zoo3's own; ours takes its name there.
+STORE_DICT: Any = rl_zoo3.utils.StoreDict
+
+
+class NamedStoreDict(STORE_DICT):  # type: ignore[misc]
+    """``key:value`` pairs whose values are Python; says which one is not."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        for pair in values:
+            key, colon, value = pair.partition(":")
+            try:
+                super().__call__(parser, namespace, [pair], option_string)
+            except Exception as error:
+                quoted = f"{key}:\"'{value}'\"" if colon else "alpha:0.7"
+                parser.error(f"{option_string} {pair}: {value!r} is no Python ({error}); write it like {quoted}")
+        super().__call__(parser, namespace, values, option_string)
+
+
+@contextmanager
+def command_line(command: str, arguments: list[str]) -> Iterator[None]:
+    """Arguments for rl_zoo3, which reads them from ``sys.argv`` and nowhere else."""
+    before, sys.argv = sys.argv, [f"sb3-sap {command}", *arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before

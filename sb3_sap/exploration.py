@@ -33,6 +33,8 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     :param alpha_low: the same while E's balanced validation accuracy is below 70 % (the paper gives no value)
     :param t_k: steps with noise and without guidance, counted over the model's whole life. ``None``:
         ``learning_starts``, whose uniform random steps count inside it
+    :param guidance_end: the step, counted as for ``t_k``, from which on the base algorithm acts and learns by itself
+        again; ``None``, the paper's: never. E goes on being fitted
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
     :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
@@ -52,6 +54,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         alpha: float = 0.9,
         alpha_low: float = 0.5,
         t_k: int | None = None,
+        guidance_end: int | None = None,
         candidate_selection: str = "random",
         actor_permissibility_coef: float | Schedule | str = 0.0,
         **kwargs: Any,
@@ -59,6 +62,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         self.alpha = alpha
         self.alpha_low = alpha_low
         self.t_k = t_k
+        self.guidance_end = guidance_end
         self.candidate_selection = candidate_selection
         self.actor_permissibility_coef = as_schedule(actor_permissibility_coef, "actor_permissibility_coef")
         self._steps_of_earlier_learns = 0
@@ -71,6 +75,12 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
                 raise ValueError(f"`{name}` is a probability from 0 to 1, but is {probability!r}.")
         if self.t_k is not None and self.t_k < 0:
             raise ValueError(f"`t_k` is a number of steps, 0 or more, but is {self.t_k}.")
+        if self.guidance_end is not None and self.guidance_end <= self.noise_steps:
+            warnings.warn(
+                f"`guidance_end` = {self.guidance_end} leaves no step to guidance, which begins after "
+                f"{self.noise_steps} (`t_k`, or `learning_starts` where that is None).",
+                stacklevel=2,
+            )
         if self.candidate_selection not in SELECTIONS:
             raise ValueError(
                 f"`candidate_selection` must be one of {', '.join(map(repr, SELECTIONS))}, but is "
@@ -107,6 +117,16 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         return self.learning_starts if self.t_k is None else self.t_k
 
     @property
+    def life_steps(self) -> int:
+        """Steps taken over the model's whole life."""
+        return self._steps_of_earlier_learns + self.num_timesteps
+
+    @property
+    def guidance_ended(self) -> bool:
+        """Whether the base algorithm is by itself again."""
+        return self.guidance_end is not None and self.life_steps >= self.guidance_end
+
+    @property
     def current_alpha(self) -> float:
         """α as E's validation accuracy allows it (section 4.3)."""
         return self.alpha if self.predictor_suffices else min(self.alpha_low, self.alpha)
@@ -115,7 +135,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         before = self._n_updates
         super().train(gradient_steps, batch_size)
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
-        if coef == 0 or not self.predictor_suffices:
+        if coef == 0 or self.guidance_ended or not self.predictor_suffices:
             return
         for _ in range(self.refits_due(before, self._n_updates)):
             loss = permissible_actor_step(
@@ -131,9 +151,11 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        if self._steps_of_earlier_learns + self.num_timesteps < self.noise_steps:
+        if self.life_steps < self.noise_steps:
             return super()._sample_action(learning_starts, action_noise, n_envs)  # Alg. 1, lines 1-4
         # After t_k there is neither noise nor, in a second `learn()`, another uniform warm-up.
+        if self.guidance_ended:
+            return super()._sample_action(0, action_noise, n_envs)
         action, scaled = super()._sample_action(0, None, n_envs)  # Alg. 1, line 1
         if self.predictor.fitted:
             guided = self._guide(scaled)

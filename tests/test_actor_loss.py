@@ -124,3 +124,13 @@ def test_it_acts_as_often_as_e_is_fitted(monkeypatch):
         model.train(updates, 8)
         numbers.append(len(calls))
     assert numbers == [1, 2, 2, 5]
+
+
+def test_it_ends_with_guidance(monkeypatch):
+    steps = []
+    model = build(DDPGAP, actor_permissibility_coef=1.0, guidance_end=60)
+    monkeypatch.setattr(
+        "sb3_sap.exploration.permissible_actor_step", lambda *args: steps.append(model.num_timesteps) or 0.0
+    )
+    model.learn(100)
+    assert 50 < max(steps) < 60

@@ -151,8 +151,15 @@ def test_t_k_beyond_the_warm_up_without_noise_warns(algorithm):
         build(algorithm, t_k=11)
 
 
+def test_an_end_of_guidance_before_its_beginning_warns():
+    with pytest.warns(UserWarning, match="^`guidance_end` = 10 leaves no step to guidance, which begins after 10"):
+        build(DDPGAP, guidance_end=10)
+
+
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("settings", [{}, {"t_k": 10}, {"t_k": 11, "action_noise": {"type": "normal", "sigma": 0.1}}])
+@pytest.mark.parametrize(
+    "settings", [{"guidance_end": 11}, {"t_k": 10}, {"t_k": 11, "action_noise": {"type": "normal", "sigma": 0.1}}]
+)
 def test_no_warning_where_the_policy_explores(settings):
     build(DDPGAP, **settings)
     build(SACAP, t_k=11)

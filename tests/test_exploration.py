@@ -110,6 +110,23 @@ def test_after_t_k_no_warm_up():
     assert sample(model)[1] == np.float32(0.125)
 
 
+def test_where_guidance_ends_the_base_is_by_itself_again_with_its_noise():
+    model = guided([[0.125]], never, learning_starts=10, t_k=20, guidance_end=50, action_noise=Constant(0.25))
+    model.num_timesteps = 50
+    model.action_space.sample = Mock(side_effect=AssertionError)  # no second warm-up
+    assert sample(model, model.action_noise)[1] == pytest.approx(0.375)
+    model.num_timesteps, model.predictor = 49, StubPredictor(above(0), True)
+    assert sample(model, model.action_noise)[1] == np.float32(0.125)
+    assert model.predictor.asked == [1]
+
+
+def test_the_end_of_guidance_is_counted_over_several_learns():
+    model = build(DDPGAP, guidance_end=30).learn(20)
+    assert not model.guidance_ended
+    model.learn(10)
+    assert model.guidance_ended
+
+
 def test_not_consulted():  # line 5
     action, scaled = sample(guided([[-0.25]], never, alpha=0.0))
     assert action == scaled == np.float32(-0.25)

@@ -14,7 +14,7 @@ from sb3_sap.benchmark.figures import with_averages
 from sb3_sap.benchmark.measures import median_reached, per_run, steps_to_competence, wall_to_competence
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.benchmark.results import collect
-from sb3_sap.benchmark.tables import improvement
+from sb3_sap.benchmark.summary import improvement
 from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, LAP_COLUMNS, TIME_COLUMNS
 from sb3_sap.cli import main
 from sb3_sap.statistics import probability_of_improvement
@@ -119,6 +119,16 @@ def test_guided_columns_are_compared_with_their_base_and_the_best_peer(tmp_path)
     }
 
 
+def test_the_headline_is_a_table_of_s_and_laps(tmp_path):
+    make(tmp_path, ["ddpg_ap:paper", "ddpg:paper", "linear"])
+    assert report(tmp_path, "--columns", "ddpg_ap:paper", "ddpg:paper", "linear", name="headline") == 0
+    header, _, ap, ddpg, linear = (tmp_path / "highway-3000" / "headline.md").read_text().splitlines()
+    assert header.startswith("| column | S after 250 steps (laps) | S after 500 steps (laps) |")
+    assert ap.split(" | ")[:3] == ["| ddpg_ap:paper", "0.911 [0.910, 0.912] (8 of 8)", "0.961 [0.960, 0.962] (8 of 8)"]
+    assert "(0 of 8)" in ddpg
+    assert linear.count("0.900 (4 of 4)") == 4
+
+
 def report(out, *arguments, name="report"):
     return main(["benchmark", name, "--simulator", "highway", "--seeds", "2", "--out", str(out), *arguments])
 
@@ -134,7 +144,7 @@ def test_all_reports_of_the_runs_that_there_are(tmp_path, capsys):
     figures = ("figure4a", "figure4b", "figure5", "curve")
     curves = {f"{name}.{kind}" for name in figures for kind in ("png", "svg", "csv")}
     pages = {f"{name}.md" for name in ("table2", "figure4", "figure5", "curve", "summary")}
-    assert files(folder) == curves | pages | {"table2.csv", "summary.csv", "summary_improvement.csv"}
+    assert files(folder) == curves | pages | {"headline.md", "table2.csv", "summary.csv", "summary_improvement.csv"}
     assert "ablations is left out" in capsys.readouterr().out
     for name in figures:
         with Image.open(folder / f"{name}.png") as image:

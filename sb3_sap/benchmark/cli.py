@@ -25,6 +25,7 @@ REPORTS = {
     "figure5": (["ddpg_ap:paper", "ddpg_ap_ce2:paper", "ddpg_ap:default"], "Figure 5: accuracy of the AP predictor"),
     "curve": (["all"], "S and laps on the unseen tracks against training steps"),
     "summary": (["all"], "statistics of all columns, and how probably one beats another"),
+    "headline": (["headline"], "the README's table: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "the same of DDPG-AP with one thing changed at a time"),
 }
 #: Trainings of the paper, by their steps.
@@ -67,7 +68,7 @@ def _add_columns(command: argparse.ArgumentParser, columns: list[str]) -> None:
         nargs="+",
         default=columns,
         metavar="COLUMN",
-        help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, sbx, ablations, all; "
+        help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, headline, sbx, ablations, harder, all; "
         "of a task the presets are task, tuned and default",
     )
 
@@ -156,7 +157,7 @@ def _run_missing(options: argparse.Namespace, steps: int, console: Console) -> i
 
 
 def _write(options: argparse.Namespace, name: str, console: Console, known_alone: bool = False) -> None:
-    from sb3_sap.benchmark import figures, returns, tables
+    from sb3_sap.benchmark import figures, returns, summary, tables
     from sb3_sap.benchmark.results import collect
 
     folder = _folder(options, options.steps)
@@ -166,8 +167,9 @@ def _write(options: argparse.Namespace, name: str, console: Console, known_alone
         "figure4": figures.figure_4,
         "figure5": figures.figure_5,
         "curve": figures.curve,
-        "summary": tables.summary,
-        "ablations": tables.ablations,
+        "summary": summary.summary,
+        "headline": tables.headline,
+        "ablations": summary.ablations,
         "returns": returns.returns,
     }[name]
     write(results, folder, command_line(options, name))

@@ -25,6 +25,12 @@ GROUPS: dict[str, list[str]] = {
     "peers": [f"{algo}:{preset}" for preset in ("default", "tuned") for algo in _PEERS],
     # guided, as the constructor leaves it and as fast as it gets
     "guided": ["ddpg_ap:default", *(f"{algo}:fast" for algo in _GUIDED)],
+    # what the README shows
+    "headline": [
+        *("tqc_ap:fast", "tqc:tuned", "tqc:default", "sac_ap:fast", "sac:tuned", "sac:default"),
+        *("td3_ap:fast", "td3:tuned", "td3:default", "ddpg_ap:fast", "ddpg_ap:default", "ddpg:default"),
+        *("ddpg_ap:paper", "ddpg:paper", "linear"),
+    ],
     # the peers in JAX, which people pick for wall-clock
     "sbx": [f"sbx_{algo}:{preset}" for preset in ("default", "tuned") for algo in _PEERS],
     # one thing changed at a time in DDPG-AP

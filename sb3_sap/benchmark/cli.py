@@ -68,8 +68,8 @@ def _add_columns(command: argparse.ArgumentParser, columns: list[str]) -> None:
         nargs="+",
         default=columns,
         metavar="COLUMN",
-        help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, headline, sbx, ablations, harder, all; "
-        "of a task the presets are task, tuned and default",
+        help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, headline, sbx, "
+        "ablations, harder, all; of a task the presets are task, tuned and default",
     )
 
 

@@ -65,7 +65,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
     _add_simulator(command)
     command.add_argument("--out", type=Path, default=default.out, help="output folder")
-    command.add_argument("--no-animation", dest="animation", action="store_false", help="leave out lap.gif")
+    command.add_argument("--animation", action=argparse.BooleanOptionalAction, default=True, help="draw lap.gif")
     command.set_defaults(run=_demo)
 
 

@@ -54,8 +54,8 @@ class Run:
     @property
     def command(self) -> str:
         """The command that does the same again."""
-        names = ("algo", "preset", "steps", "seed", "track", "simulator")
-        words = [word for name in names for word in (f"--{name}", str(getattr(self, name)))]
+        given = {name: getattr(self, name) for name in ("algo", "preset", "steps", "seed", "track", "simulator")}
+        words = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
         return shlex.join(["sb3-sap", "demo", *words])
 
 

@@ -1,8 +1,8 @@
 """The commands that a user types."""
 
 import json
-import shlex
 import os
+import shlex
 import signal
 import subprocess
 import sys

@@ -43,7 +43,8 @@ def rows_of(act, env_id=CAR, algo="ddpg_ap", episodes=("10000", "10001")):
 
 
 def test_a_guided_column_its_base_and_the_peer():
-    assert task_columns(CAR) == ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=200000,seeds=3]"]
+    assert task_columns(CAR) == ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=200000,seeds=3]", "rule"]
+    assert "rule" not in task_columns("sap/TorcsDriving-v0")  # the environment itself labels
     guided, base, tuned, default = (
         cell(text) for text in ("ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=300]", "ddpg")
     )
@@ -74,6 +75,10 @@ def test_a_column_may_have_fewer_seeds():
         ("ddpg:paper", CAR, "ddpg has no preset 'paper'"),
         ("ddpg:task[steps=0]", CAR, "steps must be 1 or more, but is 0"),
         ("ddpg:task[alpha=1]", CAR, "ddpg has no setting 'alpha'"),
+        ("linear", CAR, f"The column linear is for lane keeping, but {CAR} is not"),
+        ("rule", "sap/TorcsDriving-v0", "a task whose entry in zoo_configs names an AP function, but sap/TorcsDriving"),
+        ("rule", "highway", "names an AP function, but highway is not"),
+        ("rule[alpha=1]", CAR, "rule has no setting 'alpha'"),
     ],
 )
 def test_wrong_columns_are_told_in_one_sentence(text, env_id, message):
@@ -153,10 +158,47 @@ def test_one_run_yields_everything():
     assert result["episodes"]["data"] == [[40, 40, result["episodes"]["data"][0][2], "unfinished"]]
 
 
+# ------------------------------------------------------------------ the AP function by itself
+
+
+def told_by_the_rule(text, env_id, episodes=("10000", "10001"), seed=0):
+    of = cell(text, env_id, seed=seed, episodes=episodes)
+    assert (of.steps, of.checkpoints) == (0, [0])
+    result = run_cell(of, 0.0)
+    assert result["curve"]["data"] == result["times"]["data"] == []
+    return [dict(zip(RETURN_COLUMNS, row, strict=True)) for row in result["laps"]["data"]]
+
+
+def test_the_rule_takes_permissible_actions_alone():
+    rows = told_by_the_rule("rule", CAR)
+    assert [row["permissible"] for row in rows] == [1.0, 1.0]
+    assert all(row["total_reward"] > 90 for row in rows)  # to pump energy is to solve it
+    assert rows == told_by_the_rule("rule", CAR) != told_by_the_rule("rule", CAR, seed=1)
+
+
+def idle(obs, actions, next_obs):
+    """Nothing but no torque is permissible."""
+    return actions.reshape(-1) == 1
+
+
+def never(obs, actions, next_obs):
+    return np.zeros(len(actions), dtype=bool)
+
+
+def test_the_rule_tries_out_what_an_action_does_in_a_copy():
+    [row] = told_by_the_rule(f"rule[ap_function={__name__}.idle]", "Acrobot-v1", ("10000",))
+    assert (row["permissible"], row["total_reward"]) == (1.0, -500.0)  # hanging as it was
+    [row] = told_by_the_rule(f"rule[ap_function={__name__}.never]", "Acrobot-v1", ("10000",))
+    assert row["permissible"] == 0.0
+    assert row["steps"] > 100  # nothing is permissible: it goes on at random
+    rows = told_by_the_rule("rule", "parking-v0", ("10000",))  # a goal, two actions
+    assert [row["success"] for row in rows] == [False]
+
+
 # ------------------------------------------------------------------ report
 
 #: Mean return at half of the training and at its end, by column.
-RETURNS = {"ddpg_ap:task": (91, 95), "ddpg:task": (0, 0), "ddpg:tuned": (-20, 93)}
+RETURNS = {"ddpg_ap:task": (91, 95), "ddpg:task": (0, 0), "ddpg:tuned": (-20, 93), "rule": (0, 50)}
 
 
 def synthetic(of, name):
@@ -167,9 +209,9 @@ def synthetic(of, name):
         data += [[point, track, None, 0.9, value, value, 10] for track in of.tracks]
     tables = {
         "laps": (RETURN_COLUMNS, data),
-        "times": (TIME_COLUMNS, [[of.steps, 3.0, 2.0, 2.0]]),
-        "curve": (CURVE_COLUMNS, [[25, 1.0, 0.8, 0.7]]),
-        "episodes": (EPISODE_COLUMNS, [[of.steps, of.steps, 1.0, "unfinished"]]),
+        "times": (TIME_COLUMNS, [[of.steps, 3.0, 2.0, 2.0]] if of.steps else []),
+        "curve": (CURVE_COLUMNS, [[25, 1.0, 0.8, 0.7]] if of.steps else []),
+        "episodes": (EPISODE_COLUMNS, [[of.steps, of.steps, 1.0, "unfinished"]] if of.steps else []),
     }
     return {"cell": of.description(), "made": MADE} | {
         table: {"columns": columns, "data": rows} for table, (columns, rows) in tables.items()
@@ -177,7 +219,7 @@ def synthetic(of, name):
 
 
 def test_the_command_writes_a_page(tmp_path, monkeypatch, capsys):
-    columns = ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=100,seeds=1]"]
+    columns = ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=100,seeds=1]", "rule"]
     grid = make_grid(parse_columns(columns), CAR, 40, range(2), EPISODES)
     folder = tmp_path / CAR
     for column, cells in grid.items():
@@ -190,7 +232,9 @@ def test_the_command_writes_a_page(tmp_path, monkeypatch, capsys):
     assert "| ddpg_ap:task | 40 | 2 | 95.5 [95, 96] | 95 | 2 (2 of 2) | 90.0% | 0.800 | 50.0 |" in page
     assert "| ddpg:task | 40 | 2 | 0.5 [0, 1] | 0 | – (0 of 2) |" in page
     assert "| ddpg:tuned[steps=100,seeds=1] | 100 | 1 | 93 [93, 93] | 93 | 100 (1 of 1) |" in page
+    assert "| rule | 0 | 2 | 50.5 [50, 51] | 50 | – (0 of 2) | 90.0% |  |  |" in page
     assert "| ddpg_ap:task | ddpg:task | 1.00 [1.00, 1.00] |" in page
+    assert "| ddpg_ap:task | rule | 1.00 [1.00, 1.00] |" in page
     assert f"Made by `sb3-sap benchmark task {CAR} --steps 40 --seeds 2 --columns" in page
     assert {path.name for path in folder.glob("returns*")} == {
         "returns.md",

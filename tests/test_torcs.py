@@ -302,7 +302,7 @@ def test_libraries_are_used_again(torcs):
 
 
 def test_closing_gives_everything_back(torcs):
-    def make_and_close(times):
+    def resident_after(times):
         for _ in range(times):
             simulation = Simulation("g-track-3")
             simulation.place(0.0)
@@ -310,8 +310,13 @@ def test_closing_gives_everything_back(torcs):
         gc.collect()
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4  # KiB
 
-    before = make_and_close(20)
-    assert make_and_close(60) - before < 1_000  # each car's parameters are 0.1 MB
+    before = resident_after(20)
+    growth = []
+    for _ in range(3):  # the allocator takes a page now and then: a leak grows every time
+        after = resident_after(60)
+        growth.append(after - before)
+        before = after
+    assert min(growth) < 1_000  # each car's parameters are 0.1 MB
 
 
 # ---------------------------------------------------------------- what users do wrong

@@ -58,12 +58,13 @@ def make_cell(column: Column, simulator: str, steps: int, seed: int, tracks: Ite
     settings = settings_of(column, simulator, steps)
     if simulator in ENVIRONMENTS:
         training = {"track": "wheel-2", "laps": None} | environment_of(column)
-        if column.algo == "linear":  # nothing to learn, nothing random
+        if not column.learns:  # nothing is random either
             steps = seed = 0
         checkpoints = sorted({point for point in CHECKPOINTS if point < steps} | {steps})
     else:
         training = entry(column.algo, simulator).get("env_kwargs", {}) | environment_of(column)
-        checkpoints = evaluations(steps)
+        steps = steps if column.learns else 0
+        checkpoints = evaluations(steps) if column.learns else [0]
     defaults = defaults_of(column, settings)
     return Cell(simulator, column.algo, settings, defaults, training, steps, seed, list(tracks), checkpoints)
 

@@ -56,6 +56,8 @@ GROUPS: dict[str, list[str]] = {
         for column in (f"{algo}_ap:fast", f"{algo}:tuned")
     ],
 }
+#: Columns of controllers that learn nothing, and have no presets.
+CONTROLLERS = ("linear", "rule")
 #: Overrides that belong to the run: a training of its own length, and only the first so many seeds.
 RUN = ("steps", "seeds")
 GROUPS["all"] = [*PAPER, *GROUPS["guided"], *GROUPS["peers"], *GROUPS["sbx"], "linear"]
@@ -72,10 +74,13 @@ class Column:
     @property
     def name(self) -> str:
         """As it is written, in one way only."""
-        if self.algo == "linear":
-            return self.algo
         changed = ",".join(f"{key}={value}" for key, value in self.overrides)
-        return f"{self.algo}:{self.preset}" + (f"[{changed}]" if changed else "")
+        return (f"{self.algo}:{self.preset}" if self.learns else self.algo) + (f"[{changed}]" if changed else "")
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is a training."""
+        return self.algo not in CONTROLLERS
 
     @property
     def changes(self) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
-from sb3_sap.benchmark.columns import Column, unknown_algorithm
+from sb3_sap.benchmark.columns import CONTROLLERS, Column, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
-from sb3_sap.benchmark.tasks import task_settings
+from sb3_sap.benchmark.tasks import entry, task_settings
 from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import preset
@@ -47,7 +47,7 @@ ENVIRONMENT = "env."
 def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
     """The class of an algorithm."""
     if algo not in CLASSES:
-        raise unknown_algorithm(algo, [*CLASSES, "linear"])
+        raise unknown_algorithm(algo, [*CLASSES, *CONTROLLERS])
     module, _, name = CLASSES[algo].partition(":")
     try:
         found: type[OffPolicyAlgorithm] = getattr(importlib.import_module(module), name)
@@ -60,8 +60,8 @@ def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
 
 def settings_of(column: Column, simulator: str, steps: int) -> dict[str, Any]:
     """Constructor arguments: the preset's, with the column's overrides."""
-    if column.algo == "linear":
-        base: dict[str, Any] = dict(GAINS[simulator])
+    if not column.learns:
+        base = _of_controller(column.algo, simulator)
         known = set(base)
     else:
         known = set(inspect.signature(algorithm_class(column.algo)).parameters)
@@ -81,9 +81,19 @@ def settings_of(column: Column, simulator: str, steps: int) -> dict[str, Any]:
     return settings
 
 
+def _of_controller(algo: str, simulator: str) -> dict[str, Any]:
+    """Parameters of a controller that learns nothing: gains for a lane, an AP function for what can be copied."""
+    if algo == "linear" and simulator in GAINS:
+        return dict(GAINS[simulator])
+    if algo == "rule" and simulator not in ENVIRONMENTS and "ap_function" in (own := entry(algo, simulator)):
+        return {"ap_function": own["ap_function"]}
+    needed = "lane keeping" if algo == "linear" else "a task whose entry in zoo_configs names an AP function"
+    raise ValueError(f"The column {algo} is for {needed}, but {simulator} is not.")
+
+
 def defaults_of(column: Column, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The constructor's own values of what the settings leave open: when a library changes them, results are others."""
-    if column.algo == "linear":
+    if not column.learns:
         return {}
     parameters = inspect.signature(algorithm_class(column.algo)).parameters.values()
     plain = (bool, int, float, str, tuple, type(None))

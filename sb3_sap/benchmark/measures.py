@@ -55,7 +55,7 @@ def per_run(results: Results) -> pd.DataFrame:
         runs[f"steps_to_{threshold}"] = steps_to_competence(results.laps, threshold)
     runs["wall_to_0.95"] = wall_to_competence(results, 0.95)
     lost = results.episodes[results.episodes["ended"].isin(LOST)]
-    learners = [column.name for column in results.columns if column.algo != "linear"]
+    learners = [column.name for column in results.columns if column.learns]
     learns = runs.index.get_level_values("column").isin(learners)
     runs["off_track"] = lost.groupby(keys).size()
     runs.loc[learns, "off_track"] = runs.loc[learns, "off_track"].fillna(0)

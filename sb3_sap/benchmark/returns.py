@@ -29,7 +29,7 @@ def returns(results: Results, folder: Path, command: str) -> None:
     """Writes ``returns.md``, its picture, ``returns.csv`` of all episodes and ``returns_improvement.csv``."""
     write_csv(folder / "returns.csv", results.laps.drop(columns="score").rename(columns={"track": "episode"}))
     runs = mean_returns(results.laps)
-    write_figure(folder / "returns", _figure(runs, results.names))
+    write_figure(folder / "returns", _figure(runs, results))
     spec = gym.spec(results.simulator)
     table = pd.DataFrame([_row(results, runs, name, spec.reward_threshold) for name in results.names])
     improvements = improvement(runs, results)
@@ -93,10 +93,11 @@ def _row(results: Results, runs: pd.DataFrame, name: str, threshold: float | Non
     curve = results.curve[results.curve["column"] == name]
     time = results.times[results.times["column"] == name].groupby("seed").last()
     accuracy = pd.to_numeric(curve["accuracy"]).mean()
+    milliseconds = (1000 * time["training_seconds"] / time["checkpoint"]).median()
     return row | {
         "permissible": f"{last['permissible'].mean():.1%}",
         "accuracy of E": "" if np.isnan(accuracy) else f"{accuracy:.3f}",
-        "ms per step": f"{(1000 * time['training_seconds'] / time['checkpoint']).median():.1f}",
+        "ms per step": "" if np.isnan(milliseconds) else f"{milliseconds:.1f}",
     }
 
 
@@ -114,10 +115,16 @@ def _told(values: FloatArray) -> str:
     return f"{interquartile_mean(values):.4g} [{low:.4g}, {high:.4g}]"
 
 
-def _figure(runs: pd.DataFrame, names: list[str]) -> Figure:
-    figure = line_figure(runs, names, "checkpoint", "return", "training step", "mean return of the actor alone")
+def _figure(runs: pd.DataFrame, results: Results) -> Figure:
+    learners = [column.name for column in results.columns if column.learns]
+    figure = line_figure(runs, learners, "checkpoint", "return", "training step", "mean return of the actor alone")
+    axes = figure.axes[0]
+    for name in set(results.names) - set(learners):
+        level = interquartile_mean(final(runs, name))
+        axes.axhline(level, color="k", linestyle="--", linewidth=0.8)
+        axes.annotate(name, (1, level), xycoords=("axes fraction", "data"), va="bottom", ha="right")
     # A peer's longer training would press ours against the axis.
-    lengths = runs.groupby("column")["checkpoint"].max()
+    lengths = runs[runs["column"].isin(learners)].groupby("column")["checkpoint"].max()
     if lengths.max() > 2 * lengths.min():
-        figure.axes[0].set_xscale("log")
+        axes.set_xscale("log")
     return figure

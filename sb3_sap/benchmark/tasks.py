@@ -46,7 +46,9 @@ def entry(algo: str, env_id: str) -> dict[str, Any]:
 
 
 def task_columns(env_id: str) -> list[str]:
-    """Each guided algorithm with an entry, its base at equal settings, and RL Zoo's tuned entry where there is one."""
+    """Each guided algorithm with an entry, its base at equal settings, RL Zoo's tuned entry where there is one; and
+    the AP function by itself, unless it is the environment that labels.
+    """
     columns = []
     for algo in guided_algorithms(env_id):
         base = algo.partition("_ap")[0]
@@ -55,7 +57,7 @@ def task_columns(env_id: str) -> list[str]:
         if tuned:
             steps = min(int(tuned["n_timesteps"]), LONGER * planned_steps(env_id))
             columns.append(f"{base}:tuned[steps={steps},seeds={FEWER}]")
-    return columns
+    return columns + (["rule"] if "ap_function" in entry("rule", env_id) else [])
 
 
 def planned_steps(env_id: str) -> int:

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_sap.benchmark.cells import Cell
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.linear import LinearFeedback
+from sb3_sap.benchmark.rule import random_permissible
 from sb3_sap.benchmark.tasks import RETURN_COLUMNS, evaluation, make_env
 from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD
 from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env
@@ -136,6 +137,9 @@ def run_cell(cell: Cell, began: float) -> dict[str, Any]:
     recorder = Recorder(cell.checkpoints, evaluate, clock)
     if cell.algo == "linear":
         recorder.laps = [[0, *row] for row in evaluate(LinearFeedback(**cell.settings))]
+    elif cell.algo == "rule":
+        played = random_permissible(cell.simulator, cell.settings["ap_function"], cell.training, cell.tracks, cell.seed)
+        recorder.laps = [[0, *row] for row in played]
     else:
         env = make_env(ENVIRONMENTS.get(cell.simulator, cell.simulator), cell.training)
         model = make_model(cell.algo, env, cell.settings, cell.seed)

@@ -48,6 +48,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     from sb3_sap.demo import Run
 
     default = Run()
+    steering = [name for name in ALGORITHMS if "dqn" not in name]  # whose actions are finite
     command = commands.add_parser(
         "demo",
         help="train a car to keep its lane, then drive the unseen tracks",
@@ -56,7 +57,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "predictor.png and lap.gif in the output folder.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    command.add_argument("--algo", choices=list(ALGORITHMS), default=default.algo, help="the algorithm")
+    command.add_argument("--algo", choices=steering, default=default.algo, help="the algorithm")
     command.add_argument(
         "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
     )

@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional as F
 
+from sb3_sap.candidates import action_values
 from sb3_sap.predictor import PermissibilityPredictor, flush_denormals
 
 
@@ -41,4 +42,42 @@ def permissible_actor_step(
     actor.optimizer.zero_grad()
     loss.backward(inputs=list(actor.parameters()))  # type: ignore[no-untyped-call]
     actor.optimizer.step()
+    return loss.item()
+
+
+@flush_denormals()
+def permissible_value_step(
+    model: Any,
+    predictor: PermissibilityPredictor,
+    replay_buffer: ReplayBuffer,
+    coef: float,
+    batch_size: int,
+    env: VecNormalize | None = None,
+) -> float:
+    """The same for finite actions, where the largest value acts: one gradient step on β · softplus(Q(s, a) − Q(s, b)).
+
+    a is each action that E rejects, b the best that it permits: the cross-entropy of preferring b. What guidance
+    keeps from being executed is never corrected by experience: where rewards are negative, an unknown action looks
+    better than all that is known. By Definition 3 no optimal policy takes it, so its value is free. Both values move,
+    because lowering one alone lowers all that share its features, without end.
+
+    :param model: DQN or QR-DQN
+    :return: the loss before the step; 0 where E does not tell the actions of any state apart
+    """
+    observations = replay_buffer.sample(batch_size, env=env).observations
+    model.policy.set_training_mode(False)
+    values = action_values(model, observations)  # (n, k)
+    n, k = values.shape
+    with th.no_grad():
+        every = th.arange(k, device=values.device).repeat(n, 1)
+        features = predictor.features(observations).repeat_interleave(k, dim=0)
+        rejected = (predictor.logits(features, every.flatten()) <= 0).reshape(n, k)
+    best = values.masked_fill(rejected, -th.inf).max(dim=1, keepdim=True).values
+    told = rejected & best.isfinite()
+    if not told.any():
+        return 0.0
+    loss = coef * F.softplus(values - best)[told].mean()
+    model.policy.optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    model.policy.optimizer.step()
     return loss.item()

@@ -73,6 +73,11 @@ def q_values(model: Any, obs: Any, actions: th.Tensor) -> th.Tensor:
         if isinstance(values, tuple):
             return th.cat(values, dim=1).min(dim=1).values
         return values.mean(dim=(1, 2))  # type: ignore[no-any-return]  # TQC: (n, critics, quantiles)
-    # DQN: (n, actions); QR-DQN: (n, quantiles, actions)
-    values = model.quantile_net(obs).mean(dim=1) if hasattr(model, "quantile_net") else model.q_net(obs)
-    return values.gather(1, actions.long()).squeeze(1)  # type: ignore[no-any-return]
+    return action_values(model, obs).gather(1, actions.long()).squeeze(1)
+
+
+def action_values(model: Any, obs: Any) -> th.Tensor:
+    """(n, actions) values of every action of a finite space, as DQN or QR-DQN sees them."""
+    if hasattr(model, "quantile_net"):
+        return model.quantile_net(obs).mean(dim=1)  # type: ignore[no-any-return]  # (n, quantiles, actions)
+    return model.q_net(obs)  # type: ignore[no-any-return]

@@ -13,7 +13,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_sap.actor_loss import permissible_actor_step
+from sb3_sap.actor_loss import permissible_actor_step, permissible_value_step
 from sb3_sap.candidates import SELECTIONS, choose, q_values
 from sb3_sap.constraints import ConstrainedExplorationMixin, rows_of
 from sb3_sap.learning import LearnedPermissibilityMixin
@@ -38,8 +38,8 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
     :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
-        paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`). It acts while E is good enough for
-        ``alpha``
+        paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`, and for finite actions
+        :func:`~sb3_sap.actor_loss.permissible_value_step`). It acts while E is good enough for ``alpha``
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.
@@ -85,11 +85,6 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
             raise ValueError(
                 f"`candidate_selection` must be one of {', '.join(map(repr, SELECTIONS))}, but is "
                 f"{self.candidate_selection!r}."
-            )
-        if self.discrete and self.actor_permissibility_coef != 0:
-            raise ValueError(
-                f"`actor_permissibility_coef` = {self.actor_permissibility_coef!r}, but {type(self).__name__} has no "
-                "actor to teach: leave it at 0."
             )
         if self.noise_steps > self.learning_starts and self.action_noise is None and not self.stochastic_policy:
             warnings.warn(
@@ -137,9 +132,10 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
         if coef == 0 or self.guidance_ended or not self.predictor_suffices:
             return
+        step = permissible_value_step if self.discrete else permissible_actor_step
         for _ in range(self.refits_due(before, self._n_updates)):
-            loss = permissible_actor_step(
-                self.actor,
+            loss = step(
+                self if self.discrete else self.actor,
                 self.predictor,
                 cast(ReplayBuffer, self.replay_buffer),
                 coef,

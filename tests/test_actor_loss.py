@@ -5,10 +5,13 @@ import pytest
 import torch as th
 from stable_baselines3.common.utils import set_random_seed
 from torch.nn import functional as F
-from toy import GUIDED, build
+from toy import DISCRETE, GUIDED, Line, build
 
-from sb3_sap import DDPGAP, SACAP, CrossQAP
-from sb3_sap.actor_loss import permissible_actor_step
+from sb3_sap import DDPGAP, DQNAP, QRDQNAP, SACAP, CrossQAP
+from sb3_sap.actor_loss import permissible_actor_step, permissible_value_step
+from sb3_sap.candidates import action_values
+
+WIDE = {"predictor_kwargs": {"net_arch": [32]}, "dataset_size": 64, "policy_kwargs": {"net_arch": [32]}}
 
 
 def mean_action(model, observations):
@@ -73,8 +76,7 @@ def test_the_spread_of_a_stochastic_policy_is_left_alone():
 @pytest.mark.parametrize("algorithm", GUIDED)
 def test_it_teaches_the_actor_what_e_knows(algorithm):
     """E learns from 400 random steps; right of the centre only going left is permissible."""
-    wide = {"predictor_kwargs": {"net_arch": [32]}, "dataset_size": 64, "policy_kwargs": {"net_arch": [32]}}
-    model = build(algorithm, learning_starts=400, learning_rate=0.01, **wide).learn(400)
+    model = build(algorithm, learning_starts=400, learning_rate=0.01, **WIDE).learn(400)
     assert model.validation_accuracy > 0.7
     for _ in range(200):
         permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=32)
@@ -134,3 +136,73 @@ def test_it_ends_with_guidance(monkeypatch):
     )
     model.learn(100)
     assert 50 < max(steps) < 60
+
+
+# ------------------------------------------------------------------ finite actions
+
+
+class Permits:
+    """E that permits the given actions where x > 0, and every action elsewhere."""
+
+    def __init__(self, *actions):
+        self.actions = th.tensor(actions)
+
+    def features(self, obs):
+        return obs
+
+    def logits(self, features, actions):
+        return th.where((features[:, 0] > 0) & ~th.isin(actions, self.actions), -1.0, 1.0)
+
+
+def finite(algorithm, **settings):
+    return build(algorithm, Line(n_actions=3), **settings).learn(60)
+
+
+@pytest.mark.parametrize("algorithm", DISCRETE)
+def test_rejected_values_sink_below_the_best_permitted(algorithm):
+    model = finite(algorithm)
+    model.policy.optimizer = th.optim.SGD(model.policy.parameters(), lr=0.5)
+    net = model.q_net if algorithm is DQNAP else model.quantile_net
+    before, target = weights(net), weights(model.policy)
+    set_random_seed(0)
+    observations = model.replay_buffer.sample(32).observations
+    right = observations[:, 0] > 0
+    assert 0 < right.sum() < 32
+    values = net(observations) if algorithm is DQNAP else net(observations).mean(dim=1)
+    # Action 0 is rejected where x > 0, of 1 and 2 the better one stands against it.
+    excess = values[right, 0] - values[right, 1:].max(dim=1).values
+    expected = 2.0 * th.log1p(th.exp(excess)).mean()
+    gradients = th.autograd.grad(expected, list(net.parameters()))
+    set_random_seed(0)
+    loss = permissible_value_step(model, Permits(1, 2), model.replay_buffer, coef=2.0, batch_size=32)
+    assert loss == pytest.approx(expected.item(), rel=1e-5)
+    for (name, parameter), gradient in zip(net.named_parameters(), gradients, strict=True):
+        th.testing.assert_close(parameter, before[name] - 0.5 * gradient)
+    targets = {name: value for name, value in weights(model.policy).items() if "target" in name}
+    assert targets
+    assert same(targets, target)
+
+
+@pytest.mark.parametrize("permitted", [(), (0, 1, 2)])
+def test_where_e_tells_no_actions_apart_nothing_moves(permitted):
+    model = finite(DQNAP)
+    before = weights(model.policy)
+    assert permissible_value_step(model, Permits(*permitted), model.replay_buffer, coef=1.0, batch_size=32) == 0.0
+    assert same(weights(model.policy), before)
+
+
+@pytest.mark.parametrize("algorithm", DISCRETE)
+def test_it_teaches_the_values_what_e_knows(algorithm):
+    model = build(algorithm, Line(n_actions=2), learning_starts=400, learning_rate=0.01, **WIDE).learn(400)
+    assert model.validation_accuracy > 0.7
+    for _ in range(200):
+        permissible_value_step(model, model.predictor, model.replay_buffer, coef=1.0, batch_size=32)
+    rows = np.array([[-0.8, 0.5], [-0.4, 0.5], [0.4, 0.5], [0.8, 0.5]], dtype=np.float32)
+    assert model.predict(rows, deterministic=True)[0].tolist() == [1, 1, 0, 0]
+
+
+def test_values_are_taught_while_learning_and_zero_changes_no_bit():
+    plain, zero, some = (finite(QRDQNAP, actor_permissibility_coef=coef) for coef in (0.0, lambda _: 0.0, 1.0))
+    assert same(weights(plain.policy), weights(zero.policy))
+    assert not same(weights(plain.policy), weights(some.policy))
+    assert action_values(some, th.zeros(5, 2)).shape == (5, 3)

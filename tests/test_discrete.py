@@ -156,7 +156,6 @@ def test_action_space_must_be_finite(algorithm, space):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"actor_permissibility_coef": 1.0}, "^`actor_permissibility_coef` = 1.0, but DQNAP has no actor"),
         ({"actor_learning_rate": 1e-4}, "^`actor_learning_rate` = 0.0001, but DQNAP has no actor"),
         ({"constraint": "toy.nearby"}, "^`constraint` is an interval of continuous actions"),
     ],

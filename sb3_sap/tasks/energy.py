@@ -45,10 +45,11 @@ def mountain_car_continuous(obs: Array, actions: Array, next_obs: Array) -> Bool
 
 
 def mountain_car(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
-    """``MountainCar-v0``: False where the motor did not push along the motion and the flag is not within reach yet.
+    """``MountainCar-v0``: False where the motor did not push along the motion; but to turn is no mistake where the flag
+    is within reach.
 
     The flag is within reach where pushing right from now on gets there: a constant push is a conservative force, so one
-    sum tells. There the car may turn at once, which is braking.
+    sum tells. A car that moves left there may push right, which is braking.
 
     *Heuristic.* Every step costs 1, and a car that lacks energy gains none by braking or idling. But where it will have
     energy to spare, braking can make a swing shorter by a step or two.
@@ -59,7 +60,7 @@ def mountain_car(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     :return: (n,) bool
     """
     push = actions.reshape(-1).astype(float) - 1
-    return _drives(push, obs[:, 1], next_obs[:, 1]) | flag_within_reach(next_obs)
+    return _drives(push, obs[:, 1], next_obs[:, 1]) | ((push > 0) & flag_within_reach(next_obs))
 
 
 def flag_within_reach(obs: Array) -> BoolArray:

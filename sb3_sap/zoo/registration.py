@@ -33,7 +33,7 @@ def register() -> None:
         base = next(BASES[cls] for cls in algorithm.__mro__ if cls in BASES)
         ALGOS[name], samplers[name], converters[name] = algorithm, samplers[base], converters[base]
         if issubclass(algorithm, ActionPermissibilityMixin):
-            samplers[name] = guided_sampler(samplers[base], has_actor=not algorithm.discrete)
+            samplers[name] = guided_sampler(samplers[base])
             converters[name] = guided_converter(converters[base])
 
 

@@ -34,12 +34,10 @@ def sample_guidance(trial: optuna.Trial, n_timesteps: int) -> Params:
     return {"alpha": trial.suggest_float("alpha", 0.0, 1.0), "t_k": trial.suggest_int("t_k", low, high, log=True)}
 
 
-def sample_predictor(trial: optuna.Trial, has_actor: bool) -> Params:
+def sample_predictor(trial: optuna.Trial) -> Params:
     """What makes E good, and what is made of it."""
-    coef = (
-        {"actor_permissibility_coef": trial.suggest_float("actor_permissibility_coef", 0.0, 3.0)} if has_actor else {}
-    )
-    return coef | {
+    return {
+        "actor_permissibility_coef": trial.suggest_float("actor_permissibility_coef", 0.0, 3.0),
         "alpha_low": trial.suggest_float("alpha_low", 0.0, 1.0),
         "n_candidates_pow": trial.suggest_int("n_candidates_pow", 4, 8),
         "dataset_size_pow": trial.suggest_int("dataset_size_pow", 7, 11),
@@ -49,18 +47,14 @@ def sample_predictor(trial: optuna.Trial, has_actor: bool) -> Params:
     }
 
 
-def guided_sampler(base: Sampler, has_actor: bool) -> Sampler:
+def guided_sampler(base: Sampler) -> Sampler:
     """The space of a guided algorithm, given its base's. ``additional_args["guidance_only"]``: alpha and t_k alone."""
 
     def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Params) -> Params:
         guidance = sample_guidance(trial, additional_args.get("n_timesteps", DEFAULT_STEPS))
         if additional_args.get("guidance_only"):
             return guidance
-        return (
-            guidance
-            | _convert_own(sample_predictor(trial, has_actor))
-            | base(trial, n_actions, n_envs, additional_args)
-        )
+        return guidance | _convert_own(sample_predictor(trial)) | base(trial, n_actions, n_envs, additional_args)
 
     return sample
 

@@ -94,7 +94,7 @@ def test_evaluations_end_with_the_training():
     assert evaluations(50)[-2:] == [48, 50]
 
 
-@pytest.mark.parametrize("algo", ["ddpg", "sac", "tqc", "dqn"])
+@pytest.mark.parametrize("algo", ["ddpg", "sac", "tqc", "dqn", "qrdqn"])
 def test_tuned_settings_are_rl_zoo_s(algo):
     rl_zoo3 = pytest.importorskip("rl_zoo3")
     with open(f"{rl_zoo3.__path__[0]}/hyperparams/{algo}.yml", encoding="utf-8") as file:

@@ -23,6 +23,7 @@ from sb3_sap.settings import SettingsMixin, make_action_noise
 #: The class of each algorithm, imported only when it is needed.
 CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
     "dqn": "stable_baselines3:DQN",
+    "qrdqn": "sb3_contrib:QRDQN",
     "ddpg_ap_unbalanced": "sb3_sap.benchmark.ablated:DDPGAPUnbalanced",
     "ddpg_ap_proposed": "sb3_sap.benchmark.ablated:DDPGAPProposed",
     "td3": "stable_baselines3:TD3",

@@ -274,6 +274,7 @@ def test_optimize_replay_retest():
     command += ["--out", "retest", "--tracks", "wheel-2", "-params", *QUICK]
     assert main(command) == 0
     table = Path("retest/retest.md").read_text()
+    assert "`sb3-sap retest --env sap/LaneKeeping-v0 -n 60 --best 1" in table
     assert "| default |" in table
     assert f"| trial {study.best_trial.number} |" in table
     rows = Path("retest/retest.csv").read_text().splitlines()

@@ -15,7 +15,7 @@ from sb3_sap.files import atomic_path
 from sb3_sap.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
 from sb3_sap.zoo import figures
 from sb3_sap.zoo.report import markdown_table, shown, target_name
-from sb3_sap.zoo.storages import check_belongs, load_study
+from sb3_sap.zoo.storages import check_belongs, load_study, without_password
 from sb3_sap.zoo.tuning import StudyManager
 
 DEFAULT = "default"
@@ -32,7 +32,7 @@ class RetestManager(StudyManager):
         self._follow(study)
         folder = self.options.out or Path(self.log_folder) / self.algo / f"retest_{self.env_name}_{self.study_name}"
         rows = self._train_all(arms(study, self.algo, self.options.best), folder / "retest.csv")
-        text = summary(rows, study, self.options.tracks or self.options.validation_tracks)
+        text = summary(rows, study, self.options.tracks or self.options.validation_tracks, self.options.command)
         with atomic_path(folder / "retest.md") as temporary:
             temporary.write_text(text, encoding="utf-8")
         print(f"{text}\nThe comparison is in {folder}")
@@ -87,7 +87,7 @@ def arms(study: optuna.Study, algo: str, best: int) -> dict[str, dict[str, Any]]
     return {DEFAULT: {}, **winners}
 
 
-def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str]) -> str:
+def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str], command: str) -> str:
     """The comparison as Markdown: interquartile means with 95 % intervals, and differences to the default."""
     scores = {arm: _matrix(group) for arm, group in rows.groupby("arm", sort=False)}
     trials = {f"trial {trial.number}": trial for trial in study.get_trials(deepcopy=False)}
@@ -106,7 +106,8 @@ def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str]) -> str:
         table.append(row)
     header = ["settings", "changed", "in the study", "seeds", "interquartile mean", "minus default"]
     tasks = f"Laps: {', '.join(tracks)}." if tracks else f"{target_name(study).capitalize()}."
-    lines = [f"# Winners of {study.study_name} on fresh seeds", "", f"{tasks} 95 % stratified bootstrap intervals.", ""]
+    title, made = f"# Winners of {study.study_name} on fresh seeds", f"`{without_password(command)}`"
+    lines = [title, "", made, "", f"{tasks} 95 % stratified bootstrap intervals.", ""]
     return "\n".join([*lines, *markdown_table(header, table)]) + "\n"
 
 

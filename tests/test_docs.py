@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+import runpy
 import shlex
 import textwrap
 from pathlib import Path
@@ -21,14 +22,6 @@ from sb3_sap.cli import main, parser
 matplotlib.use("agg")
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(("path", "table"), re.findall(r"<!-- table: (\S+) -->\n(.*?)<!-- end -->", README, re.DOTALL))
-def test_tables_are_those_of_the_results(path, table):
-    assert table.strip() == (ROOT / path).read_text(encoding="utf-8").strip()
-
-
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES}
 LINKS = [(path, target) for path in PAGES for target in re.findall(r"\]\(((?!https?:)[^)#]+)", TEXTS[path.name])]
@@ -37,6 +30,12 @@ LINKS = [(path, target) for path in PAGES for target in re.findall(r"\]\(((?!htt
 @pytest.mark.parametrize(("page", "target"), LINKS, ids=[f"{page.name}-{target}" for page, target in LINKS])
 def test_links_lead_somewhere(page, target):
     assert (page.parent / target).exists()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_are_those_of_the_results(page):
+    with_tables = runpy.run_path(str(ROOT / "docs" / "tables.py"))["with_tables"]
+    assert TEXTS[page.name] == with_tables(page)
 
 
 # ---------------------------------------------------------------- Python snippets

@@ -36,6 +36,7 @@ GROUPS: dict[str, list[str]] = {
     # one thing changed at a time in DDPG-AP
     "ablations": [
         "ddpg_ap:default",
+        "ddpg_ap:tuned",
         *(f"ddpg_ap:default[alpha={alpha}]" for alpha in (0, 0.5, 1)),
         *(f"ddpg_ap:default[alpha_low={alpha}]" for alpha in (0, 0.9)),
         *(f"ddpg_ap:default[t_k={t_k}]" for t_k in (20, 150, 500)),

@@ -18,6 +18,8 @@ from sb3_sap.statistics import bootstrap_interval
 
 #: Training steps that Fig. 5 shows.
 ACCURACY_STEPS = 5_000
+#: Letters that fit side by side below a figure.
+LEGEND_WIDTH = 110
 BAND = "The line is the interquartile mean over seeds, the band its 95 % bootstrap interval.\n"
 
 
@@ -94,7 +96,7 @@ def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: 
             means.append(stats.trim_mean(known, 0.25))
             bands.append(bootstrap_interval(known[:, None], resamples=500))
         _line(axes, number, name, wide.index, means, *np.transpose(bands))
-    _legend(figure, len(names))
+    _legend(figure)
     return figure
 
 
@@ -106,7 +108,7 @@ def _episodes_figure(episodes: pd.DataFrame, names: list[str]) -> Figure:
             axes.plot(run["episode"], run["average_reward"], color=f"C{number}", alpha=0.5, linewidth=0.8, label=label)
             axes.plot(run["episode"].iloc[-1], run["average_reward"].iloc[-1], "o", color=f"C{number}", markersize=3)
     axes.set_xscale("log")
-    _legend(figure, len(names))
+    _legend(figure)
     return figure
 
 
@@ -124,7 +126,7 @@ def _curve_figure(table: pd.DataFrame, names: list[str]) -> Figure:
     bottom.set(xlabel="training step", ylabel="share of laps done")
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
-    _legend(figure, len(names))
+    _legend(figure)
     return figure
 
 
@@ -146,5 +148,7 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": f"C{number % 10}", "linestyle": ("-", "--", ":", "-.")[number // 10 % 4], "linewidth": 1.3}
 
 
-def _legend(figure: Figure, entries: int) -> None:
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(entries, 4))
+def _legend(figure: Figure) -> None:
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    beside = LEGEND_WIDTH // (6 + max(map(len, labels)))  # a line and a gap are as wide as six letters
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), max(1, beside)))

@@ -48,7 +48,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     from sb3_sap.demo import Run
 
     default = Run()
-    steering = [name for name in ALGORITHMS if "dqn" not in name]  # whose actions are finite
+    steering = [name for name in ALGORITHMS if "dqn" not in name]  # which choose among finite actions
     command = commands.add_parser(
         "demo",
         help="train a car to keep its lane, then drive the unseen tracks",

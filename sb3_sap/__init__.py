@@ -25,6 +25,7 @@ from sb3_sap.callbacks import PermissibilityCallback
 from sb3_sap.check import PermissibilityReport, check_permissibility
 from sb3_sap.constraints import ConstrainedExplorationMixin
 from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.features import RescaleExtractor
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import ActionPermissibility
@@ -59,6 +60,7 @@ __all__ = [
     "PermissibilityPredictor",
     "PermissibilityReplayBuffer",
     "PermissibilityReport",
+    "RescaleExtractor",
     "check_permissibility",
     "envs",
     "preset",

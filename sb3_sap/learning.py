@@ -16,6 +16,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sap.buffers import KnowledgeMixin, guided_buffer_class
 from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
+from sb3_sap.features import with_extractor
 from sb3_sap.generators import make_rng
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, resolve
@@ -121,7 +122,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
     def _make_predictor(self) -> PermissibilityPredictor:
         # Unless told otherwise E turns observations into features as the policy does.
         shared = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
-        arguments = {name: getattr(self.policy, name) for name in shared} | dict(self.predictor_kwargs or {})
+        arguments = {name: getattr(self.policy, name) for name in shared} | with_extractor(self.predictor_kwargs)
         known = inspect.signature(PermissibilityPredictor).parameters
         for name in arguments.keys() - known.keys():
             raise TypeError(

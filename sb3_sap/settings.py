@@ -18,6 +18,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, update_learning_rate
 
+from sb3_sap.features import with_extractor
+
 #: Training steps of the paper's main experiment (section 5.2).
 PAPER_STEPS = 15_000
 #: RL Zoo's way to write a schedule that falls evenly to 0.
@@ -36,6 +38,7 @@ class SettingsMixin(OffPolicyAlgorithm):
         ``"lin_0.001"`` falls evenly from 0.001 to 0 over the training
     :param action_noise: besides an SB3 ``ActionNoise``, its description as YAML can write it:
         ``{"type": "normal", "sigma": 0.1}`` or ``{"type": "ornstein-uhlenbeck", "sigma": 0.3, "theta": 0.6, "dt": 1}``
+    :param policy_kwargs: SB3's; ``features_extractor_class`` may be a dotted name
     """
 
     #: Whether the algorithm chooses among finitely many actions.
@@ -56,8 +59,8 @@ class SettingsMixin(OffPolicyAlgorithm):
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             check_action_space(type(self).__name__, env.action_space, self.discrete)
         # SB3 writes into the dictionaries that it is given.
-        for name in ("policy_kwargs", "replay_buffer_kwargs"):
-            kwargs[name] = dict(kwargs.get(name) or {})
+        kwargs["replay_buffer_kwargs"] = dict(kwargs.get("replay_buffer_kwargs") or {})
+        kwargs["policy_kwargs"] = with_extractor(kwargs.get("policy_kwargs"))
         super().__init__(policy, env, *args, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any):

@@ -16,6 +16,7 @@ from sb3_sap.benchmark.columns import CONTROLLERS, Column, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
 from sb3_sap.benchmark.tasks import entry, task_settings
 from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.features import with_extractor
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import preset
 from sb3_sap.settings import SettingsMixin, make_action_noise
@@ -114,6 +115,8 @@ def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> O
         arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
     if "replay_buffer_class" in arguments:
         arguments["replay_buffer_class"] = resolve(arguments["replay_buffer_class"], "replay_buffer_class")
+    if "policy_kwargs" in arguments:
+        arguments["policy_kwargs"] = with_extractor(arguments["policy_kwargs"])
     policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
     return cls(policy, env, seed=seed, device="cpu", **arguments)
 

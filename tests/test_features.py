@@ -1,0 +1,52 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_sap import DDPGAP, RescaleExtractor
+from sb3_sap.tasks import mountain_car_continuous
+
+CAR = "MountainCarContinuous-v0"
+NAMED = {"net_arch": [4], "features_extractor_class": "sb3_sap.RescaleExtractor"}
+
+
+def test_bounds_become_one_and_what_has_none_stays_as_it_is():
+    huge = np.finfo(np.float32).max
+    low, high = [-1.2, -0.07, -np.inf, 0, -huge, 3], [0.6, 0.07, np.inf, np.inf, huge, 3]
+    extractor = RescaleExtractor(spaces.Box(np.float32(low), np.float32(high)))
+    assert extractor.features_dim == 6
+    seen = extractor(th.tensor([[0.6, -0.07, 9.0, 8.0, -7.0, 3.0], [-0.3, 0.035, 0.0, 0.0, 0.0, 3.0]]))
+    np.testing.assert_allclose(seen, [[1, -1, 9, 8, -7, 3], [0, 0.5, 0, 0, 0, 3]], atol=1e-6)
+
+
+def test_it_flattens():
+    extractor = RescaleExtractor(spaces.Box(-2, 2, (2, 2), np.float32))
+    np.testing.assert_allclose(extractor(th.tensor([[[2.0, 1.0], [0.0, -2.0]]])), [[1, 0.5, 0, -1]])
+
+
+def test_named_as_in_yaml_policy_and_predictor_share_it_and_a_saved_model_keeps_it(tmp_path):
+    env = gym.make(CAR)
+    model = DDPGAP("MlpPolicy", env, ap_function=mountain_car_continuous, policy_kwargs=NAMED, seed=0)
+    for network in (model.actor, model.critic, model.predictor):
+        assert type(network.features_extractor) is RescaleExtractor
+    assert NAMED["features_extractor_class"] == "sb3_sap.RescaleExtractor"  # the caller's dictionary is left alone
+    model.save(tmp_path / "model")
+    loaded = DDPGAP.load(tmp_path / "model", env)
+    obs = env.observation_space.sample()
+    np.testing.assert_array_equal(model.predict(obs)[0], loaded.predict(obs)[0])
+    assert type(loaded.actor.features_extractor) is RescaleExtractor
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(3), spaces.Dict({"x": spaces.Box(-1, 1)}), spaces.Box(0, 255, (36, 36, 3), np.uint8)]
+)
+def test_other_observations_are_refused_in_a_sentence(space):
+    with pytest.raises(ValueError, match=r"^RescaleExtractor is for arrays of numbers, but .*leave `features_extr"):
+        RescaleExtractor(space)
+
+
+def test_an_extractor_that_cannot_be_imported_is_refused_in_a_sentence():
+    wrong = {"features_extractor_class": "sb3_sap.RescaleExtractr"}
+    with pytest.raises(ValueError, match=r"^`features_extractor_class`: 'sb3_sap\.RescaleExtractr' cannot be imported"):
+        DDPGAP("MlpPolicy", gym.make(CAR), ap_function=mountain_car_continuous, policy_kwargs=wrong)

@@ -49,7 +49,8 @@ def test_a_guided_column_its_base_and_the_peer():
         cell(text) for text in ("ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=300]", "ddpg")
     )
     assert guided.settings["ap_function"] == "sb3_sap.tasks.mountain_car_continuous"
-    assert base.settings == {"policy_kwargs": guided.settings["policy_kwargs"]}  # what it shares with the guided one
+    shared = ("policy_kwargs", "learning_rate")
+    assert base.settings == {name: guided.settings[name] for name in shared}
     assert tuned.settings["policy_kwargs"] == {"net_arch": [400, 300]}
     assert (tuned.steps, base.steps) == (300, 100)
     assert default.settings == {}

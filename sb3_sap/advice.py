@@ -16,6 +16,8 @@ MIN_PER_CLASS = 20
 GATE = 0.7
 #: Changes of the label along one dimension of the action from which it is called rough.
 ROUGH = 4.0
+#: Share of states below which the action decides too rarely for guidance to have a choice.
+FEW = 0.1
 #: Share of a good policy's actions whose prohibition is small print or an alarm.
 ALARM = 0.1
 
@@ -59,11 +61,12 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
             f"Only {min(rate, 1 - rate):.1%} of random actions are {rarer}: the predictor first sees {MIN_PER_CLASS} "
             f"of them after about {steps:,.0f} steps. Plan for a longer run, or for labels that say more."
         )
-    if report.action_matters == 0:
+    if report.action_matters is not None and report.action_matters < FEW:
         yield (
-            "At none of the states that were tried does the label depend on the action: no other action would have "
-            "been better, so that guidance has nothing to choose. Label what the action itself changed, such as a "
-            "difference between next_obs and obs."
+            f"At {_percent(report.action_matters)} of the states that were tried does the label depend on the action: "
+            "elsewhere no other action would have been better, so that guidance has nothing to choose. Label what the "
+            "action itself changed, such as a difference between next_obs and obs, or judge the action by what it does "
+            "to a velocity."
         )
     if report.label_changes is not None and report.label_changes > ROUGH:
         yield (

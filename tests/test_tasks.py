@@ -5,7 +5,7 @@ import highway_env  # noqa: F401  registers its environments
 import numpy as np
 import pytest
 
-from sb3_sap import tasks
+from sb3_sap import check_permissibility, tasks
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import algorithms, load_config
 from sb3_sap.tasks.driving import FAR, MISS_DISTANCE, least_distance, leaving_speed
@@ -210,3 +210,22 @@ def test_every_entry_labels_what_its_environment_returns(algo, env_id, entry):
     assert labels.shape == (60,)
     assert labels.dtype == bool
     assert 0 < labels.sum() < 60
+
+
+def swings_up(obs):
+    """Drives the energy to that of standing upright, and holds the pendulum there."""
+    cos, sin, rate = obs
+    if cos > 0.95:
+        return np.float32([np.clip(-10 * sin - 2 * rate, -2, 2)])
+    return np.float32([2 * np.sign(rate * -pendulum_energy_of(obs[None])[0]) or 2])
+
+
+def test_the_hard_case_is_warned_of():
+    env = gym.make("Pendulum-v1")
+    obs, _ = env.reset(seed=0)
+    for _ in range(200):
+        obs, *_ = env.step(swings_up(obs))
+    assert obs[0] > 0.99  # it is a good policy
+    report = check_permissibility(env, tasks.pendulum_height, policy=swings_up, verbose=False)
+    assert any("does the label depend on the action" in sentence for sentence in report.advice)
+    assert any("of your policy's own actions" in sentence for sentence in report.advice)

@@ -26,6 +26,8 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"show-inheritance": True}
 
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
 html_title = f"sb3_sap {release}"
 pygments_style = "friendly"
 

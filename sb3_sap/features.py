@@ -36,9 +36,9 @@ class RescaleExtractor(FlattenExtractor):
                 "`features_extractor_class` out, or wrap the environment."
             )
         super().__init__(observation_space)
-        low, high = (bound.astype(np.float32) for bound in (observation_space.low, observation_space.high))
         # In single precision "bounds" of ±3e38, which stand for none, are infinitely far apart.
         with np.errstate(over="ignore", invalid="ignore"):
+            low, high = (bound.astype(np.float32) for bound in (observation_space.low, observation_space.high))
             half, middle = (high - low) / 2, (high + low) / 2
         bounded = np.isfinite(half) & (half > 0)
         self.register_buffer("scale", th.as_tensor(np.where(bounded, half, 1.0), dtype=th.float32))

@@ -13,6 +13,8 @@ import matplotlib
 import matplotlib.pyplot as plt
 import pytest
 from stable_baselines3 import DDPG
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 
 import sb3_sap
 from sb3_sap import DDPGAP, envs, plots, zoo
@@ -66,6 +68,14 @@ def test_snippets_run(name, tmp_path, monkeypatch):
 
 def test_the_readme_has_its_three_snippets():
     assert len(SNIPPETS["README.md"]) == 3
+
+
+@pytest.mark.slow
+def test_the_readmes_own_problem_is_solved_as_it_says():
+    names = {}
+    exec(compile(SNIPPETS["README.md"][1], "README.md", "exec"), names)
+    assert names["model"].num_timesteps == 1_000
+    assert evaluate_policy(names["model"], Monitor(names["env"]), n_eval_episodes=5)[0] > 80
 
 
 # ---------------------------------------------------------------- commands

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_sap import DDPGAP, RescaleExtractor
 from sb3_sap.tasks import mountain_car_continuous
@@ -14,10 +15,16 @@ NAMED = {"net_arch": [4], "features_extractor_class": "sb3_sap.RescaleExtractor"
 def test_bounds_become_one_and_what_has_none_stays_as_it_is():
     huge = np.finfo(np.float32).max
     low, high = [-1.2, -0.07, -np.inf, 0, -huge, 3], [0.6, 0.07, np.inf, np.inf, huge, 3]
-    extractor = RescaleExtractor(spaces.Box(np.float32(low), np.float32(high)))
+    extractor = RescaleExtractor(spaces.Box(np.float32(low), np.float32(high), dtype=np.float32))
     assert extractor.features_dim == 6
     seen = extractor(th.tensor([[0.6, -0.07, 9.0, 8.0, -7.0, 3.0], [-0.3, 0.035, 0.0, 0.0, 0.0, 3.0]]))
     np.testing.assert_allclose(seen, [[1, -1, 9, 8, -7, 3], [0, 0.5, 0, 0, 0, 3]], atol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_bounds_beyond_single_precision_are_none():
+    extractor = RescaleExtractor(spaces.Box(-1e300, 1e300, (1,), np.float64))
+    np.testing.assert_array_equal(extractor(th.tensor([[5.0]])), [[5.0]])
 
 
 def test_it_flattens():
@@ -36,6 +43,16 @@ def test_named_as_in_yaml_policy_and_predictor_share_it_and_a_saved_model_keeps_
     obs = env.observation_space.sample()
     np.testing.assert_array_equal(model.predict(obs)[0], loaded.predict(obs)[0])
     assert type(loaded.actor.features_extractor) is RescaleExtractor
+
+
+def test_the_predictor_may_have_another_one():
+    plain = {"features_extractor_class": "stable_baselines3.common.torch_layers.FlattenExtractor"}
+    env = gym.make(CAR)
+    model = DDPGAP(
+        "MlpPolicy", env, ap_function=mountain_car_continuous, policy_kwargs=NAMED, predictor_kwargs=plain, seed=0
+    )
+    assert type(model.predictor.features_extractor) is FlattenExtractor
+    assert type(model.actor.features_extractor) is RescaleExtractor
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ def add_torcs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     """Adds the commands to the main parser."""
     torcs = commands.add_parser("torcs", help="install, check and verify TORCS, the reference simulator")
     actions = torcs.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    command = actions.add_parser("install", help="fetch Debian's packages and keep the 7 MB that are needed; no root")
+    command = actions.add_parser("install", help="fetch Debian's packages and keep the 3 MB that are needed; no root")
     command.add_argument("--root", type=Path, help="where to put it; then set TORCS_ROOT to it")
     command.set_defaults(run=_install)
     command = actions.add_parser("check", help="say which TORCS is found, and drive it for 5 seconds")

@@ -7,10 +7,15 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_sap.constraints import rows_of
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, ask, labels_from_infos
+
+#: Marks, in a step's ``info``, that its next observation is not known as it was.
+UNKNOWN = "sap_next_obs_unknown"
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -46,7 +51,11 @@ class KnowledgeMixin(ReplayBuffer):
             labels = labels_from_infos(infos)
         else:
             labels = ask(self.ap_function, "ap_function", obs, self._unscale(action), next_obs)
-        self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
+        actions, pursued = action.reshape(len(labels), -1), obs
+        if self.ap_function is not None and any(UNKNOWN in info for info in infos):
+            known = np.array([UNKNOWN not in info for info in infos])
+            pursued, actions, labels = rows_of(obs, known), actions[known], labels[known]
+        self.knowledge.add(pursued, actions, labels)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -83,6 +92,14 @@ GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
     NStepReplayBuffer: PermissibilityNStepReplayBuffer,
     HerReplayBuffer: PermissibilityHerReplayBuffer,
 }
+
+
+def reaches_clip(env: VecNormalize, observation: Any) -> bool:
+    """Whether a normalised observation may have been clipped, so that the raw one cannot be had back."""
+    if not env.norm_obs:
+        return False
+    parts = [observation[key] for key in env.norm_obs_keys] if isinstance(observation, dict) else [observation]
+    return any((np.abs(part) >= env.clip_obs).any() for part in parts)
 
 
 def guided_buffer_class(

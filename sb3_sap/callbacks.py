@@ -30,7 +30,7 @@ class PermissibilityCallback(BaseCallback):
 
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
-        self._start = 0  # time step at which the rollout began
+        self._start = 0  # step of the model's life at which the rollout began
         self._seen: tuple[int, ...] = (0, 0)
         self._warned = False
 
@@ -43,7 +43,7 @@ class PermissibilityCallback(BaseCallback):
         add_layout(self.logger)
 
     def _on_rollout_start(self) -> None:
-        self._start = self.model.num_timesteps
+        self._start = self.model.life_steps
         self._seen = tuple(self.knowledge.seen)
 
     def _on_step(self) -> bool:
@@ -53,8 +53,9 @@ class PermissibilityCallback(BaseCallback):
         # The transitions of this rollout are in K only now: `_on_step` runs before they are stored.
         knowledge = self.knowledge
         new = np.subtract(knowledge.seen, self._seen)
-        self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
-        due = self.model.refits_due(self._start // self.model.n_envs, self.model.num_timesteps // self.model.n_envs)
+        if new.any():
+            self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
+        due = self.model.refits_due(self._start // self.model.n_envs, self.model.life_steps // self.model.n_envs)
         if min(knowledge.counts("train")) >= self.model.min_per_class:
             for _ in range(due):
                 self.fit()

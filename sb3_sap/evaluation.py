@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import zipfile
 from collections.abc import Callable, Iterator
@@ -21,6 +22,18 @@ if TYPE_CHECKING:
 
 #: The lane-keeping task on each simulator.
 ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0", "torcs": "sap/TorcsLaneKeeping-v0"}
+
+
+def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
+    """``gym.make``, which finds highway-env's tasks as well."""
+    register(env_id)
+    return gym.make(env_id, **options)
+
+
+def register(env_id: str) -> None:
+    """Has highway-env register its tasks, which it does when it is imported, if the environment is not known yet."""
+    if env_id not in gym.registry:
+        importlib.import_module("highway_env")
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from numbers import Real
 from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_sap.actor_loss import permissible_actor_step, permissible_value_step
@@ -20,7 +20,7 @@ from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import FloatArray
 from sb3_sap.prediction import guided_prediction
 from sb3_sap.predictor import candidate_logits, flush_denormals
-from sb3_sap.settings import as_schedule
+from sb3_sap.settings import SettingsMixin
 
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
@@ -47,6 +47,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
 
     #: Whether the policy explores by itself, so that the steps before t_k need no action noise.
     stochastic_policy: ClassVar[bool] = False
+    schedules = (*SettingsMixin.schedules, "actor_permissibility_coef")
 
     def __init__(
         self,
@@ -64,14 +65,13 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         self.t_k = t_k
         self.guidance_end = guidance_end
         self.candidate_selection = candidate_selection
-        self.actor_permissibility_coef = as_schedule(actor_permissibility_coef, "actor_permissibility_coef")
-        self._steps_of_earlier_learns = 0
+        self.actor_permissibility_coef: Any = actor_permissibility_coef
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         for name in ("alpha", "alpha_low"):
             probability = getattr(self, name)
-            if not (isinstance(probability, (int, float)) and 0 <= probability <= 1):
+            if not (isinstance(probability, Real) and 0 <= probability <= 1):
                 raise ValueError(f"`{name}` is a probability from 0 to 1, but is {probability!r}.")
         if self.t_k is not None and self.t_k < 0:
             raise ValueError(f"`t_k` is a number of steps, 0 or more, but is {self.t_k}.")
@@ -94,27 +94,10 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
             )
         super()._setup_model()
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        if reset_num_timesteps:
-            self._steps_of_earlier_learns += self.num_timesteps
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-
     @property
     def noise_steps(self) -> int:
         """t_k, or ``learning_starts`` where it was left open."""
         return self.learning_starts if self.t_k is None else self.t_k
-
-    @property
-    def life_steps(self) -> int:
-        """Steps taken over the model's whole life."""
-        return self._steps_of_earlier_learns + self.num_timesteps
 
     @property
     def guidance_ended(self) -> bool:

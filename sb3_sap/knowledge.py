@@ -27,14 +27,16 @@ class LabelledActions(NamedTuple):
 class ClassSlots:
     """Which slots of a full or filling store belong to which class, oldest first.
 
-    When the store is full, a new tuple replaces the oldest of its class; if there is none, the oldest of the
-    other class, which is then the larger one.
+    When the store is full, a new tuple replaces the oldest of its class; of a class that has too few, the oldest of
+    the other, which is then the larger one.
 
     :param capacity: number of slots
+    :param least: tuples of a class below which it grows, at most half of the capacity
     """
 
-    def __init__(self, capacity: int):
+    def __init__(self, capacity: int, least: int = 1):
         self.capacity = capacity
+        self.least = max(1, min(least, capacity // 2))
         self.counts = [0, 0]
         self._slots = np.zeros((2, capacity), dtype=np.int64)
         self._oldest = [0, 0]
@@ -50,14 +52,14 @@ class ClassSlots:
         """The slot for a new tuple of class ``label``."""
         if len(self) < self.capacity:
             return self._append(label, len(self))
-        if self.counts[label] == 0:
+        if self.counts[label] < self.least:
             return self._append(label, self._remove_oldest(1 - label))
         position = self._oldest[label]
         self._oldest[label] = (position + 1) % self.counts[label]
         return int(self._slots[label, position])
 
     def _append(self, label: int, slot: int) -> int:
-        # Only classes that have never wrapped grow, so the newest is also the last.
+        # Only classes that have never wrapped, or have just been put in order, grow: the newest is also the last.
         self._slots[label, self.counts[label]] = slot
         self.counts[label] += 1
         return slot
@@ -80,6 +82,7 @@ class KnowledgeBuffer:
     :param size: capacity; the paper's is 10,000
     :param validation_fraction: share kept for validation; the paper's 9:1 is 0.1
     :param seed: of the generator that splits and samples
+    :param min_per_class: in each part, tuples of a class that the other class makes room for
     """
 
     def __init__(
@@ -89,6 +92,7 @@ class KnowledgeBuffer:
         size: int = 10_000,
         validation_fraction: float = 0.1,
         seed: int | None = None,
+        min_per_class: int = 1,
     ):
         if not 0 < validation_fraction < 1:
             raise ValueError(f"`validation_fraction` must lie between 0 and 1, but is {validation_fraction}.")
@@ -102,7 +106,8 @@ class KnowledgeBuffer:
         self.validation_fraction = validation_fraction
         self.seed(seed)
         self.seen = [0, 0]  # (non-permissible, permissible) tuples ever added
-        self.parts = {"train": ClassSlots(size - n_validation), "validation": ClassSlots(n_validation)}
+        capacities = {"train": size - n_validation, "validation": n_validation}
+        self.parts = {part: ClassSlots(capacity, min_per_class) for part, capacity in capacities.items()}
         # The validation part lies behind the training part in the same arrays.
         self._offset = {"train": 0, "validation": size - n_validation}
         self._keyed = isinstance(observation_space, spaces.Dict)

@@ -14,7 +14,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_sap.buffers import KnowledgeMixin, guided_buffer_class
+from sb3_sap.buffers import UNKNOWN, KnowledgeMixin, guided_buffer_class, reaches_clip
 from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.features import with_extractor
 from sb3_sap.generators import make_rng
@@ -38,7 +38,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
     :param validation_fraction: share of K kept for validation
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
-    :param min_per_class: examples of each class that K must hold before E is fitted
+    :param min_per_class: examples of each class that K must hold before E is fitted, and makes room for when it is full
     :param refit_growth: E is fitted and validated, and teaches the actor where it does, each time that the steps taken
         have grown by this share; 0, the paper's, at every step
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
@@ -67,6 +67,9 @@ class LearnedPermissibilityMixin(SettingsMixin):
         self.predictor_kwargs = predictor_kwargs
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
+        self._steps_of_earlier_learns = 0
+        #: Whether the observations of the last training were normalised.
+        self.learned_normalised = False
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -77,7 +80,10 @@ class LearnedPermissibilityMixin(SettingsMixin):
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
         self.replay_buffer_class = None
+        # It writes n_steps and gamma into these, where they would outlive a `load` with others.
+        own, self.replay_buffer_kwargs = self.replay_buffer_kwargs, dict(self.replay_buffer_kwargs)
         super()._setup_model()
+        self.replay_buffer_kwargs = own
         self.replay_buffer_class = type(self.replay_buffer)
         # A network of our own must not shift the global generator, or runs would no longer compare to the base's.
         with th.random.fork_rng(devices=[]):
@@ -97,6 +103,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
             self.knowledge_buffer_size,
             self.validation_fraction,
             self.seed,
+            self.min_per_class,
         )
         room = knowledge.parts["train"].capacity // 2
         if self.min_per_class > room:
@@ -122,7 +129,10 @@ class LearnedPermissibilityMixin(SettingsMixin):
     def _make_predictor(self) -> PermissibilityPredictor:
         # Unless told otherwise E turns observations into features as the policy does.
         shared = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
-        arguments = {name: getattr(self.policy, name) for name in shared} | with_extractor(self.predictor_kwargs)
+        own = with_extractor(self.predictor_kwargs)
+        if "features_extractor_class" in own:  # which the other's arguments would not fit
+            own = {"features_extractor_kwargs": {}, **own}
+        arguments = {name: getattr(self.policy, name) for name in shared} | own
         known = inspect.signature(PermissibilityPredictor).parameters
         for name in arguments.keys() - known.keys():
             raise TypeError(
@@ -142,6 +152,41 @@ class LearnedPermissibilityMixin(SettingsMixin):
                 callback = ConvertCallback(callback)
             callback = [PermissibilityCallback(), *(callback if isinstance(callback, list) else [callback])]
         return super()._init_callback(callback, progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps:
+            self._steps_of_earlier_learns += self.num_timesteps
+        self.learned_normalised = self._vec_normalize_env is not None
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    @property
+    def life_steps(self) -> int:
+        """Steps taken over the model's whole life."""
+        return self._steps_of_earlier_learns + self.num_timesteps
+
+    def _store_transition(
+        self,
+        replay_buffer: Any,
+        buffer_action: np.ndarray[Any, Any],
+        new_obs: Any,
+        reward: np.ndarray[Any, Any],
+        dones: np.ndarray[Any, Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # Of an episode's last observation VecNormalize keeps the clipped value alone, which nothing can be told from.
+        if self._vec_normalize_env is not None:
+            for info in infos:
+                last = info.get("terminal_observation")
+                if last is not None and reaches_clip(self._vec_normalize_env, last):
+                    info[UNKNOWN] = True
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def refits_due(self, before: int, now: int) -> int:
         """How many fits belong to the steps after ``before``, up to ``now``.

@@ -46,6 +46,11 @@ def guided_prediction(
     obs, is_batch = model.policy.obs_to_tensor(observation)
     shape = cast(Any, model.action_space).shape
     env = model.get_vec_normalize_env()
+    if env is None and model.learned_normalised and model.permissible_actions is not None:
+        raise ValueError(
+            "`permissible_actions` judges observations as the environment gives them, but this model takes normalised "
+            "ones and has no statistics to undo that: load it with its VecNormalize, `load(path, env=...)`."
+        )
     raw = observation if env is None else env.unnormalize_obs(observation)
     if not is_batch:
         raw = {key: value[None] for key, value in raw.items()} if isinstance(raw, dict) else np.asarray(raw)[None]
@@ -53,8 +58,9 @@ def guided_prediction(
     if not model.discrete:
         proposed = model.policy.scale_action(proposed)
     flat = proposed.reshape(len(proposed), -1)
-    ones = np.ones_like(flat)
+    ones = np.ones_like(flat[:1])
     candidates = candidate_actions(np.random.default_rng(0), model.action_space, -ones, ones, model.n_candidates)
+    candidates = candidates.repeat(len(flat), axis=0)  # the same beside others in a batch
     # The proposal itself comes first and is its own nearest candidate.
     candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
     permissible = model._allowed_candidates(raw, candidates)

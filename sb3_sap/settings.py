@@ -6,6 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from io import BufferedIOBase
+from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
 
@@ -43,6 +44,8 @@ class SettingsMixin(OffPolicyAlgorithm):
 
     #: Whether the algorithm chooses among finitely many actions.
     discrete: ClassVar[bool] = False
+    #: Settings that may be numbers, schedules or ``"lin_<number>"``.
+    schedules: ClassVar[tuple[str, ...]] = ("learning_rate", "actor_learning_rate")
 
     def __init__(
         self,
@@ -52,9 +55,7 @@ class SettingsMixin(OffPolicyAlgorithm):
         actor_learning_rate: float | Schedule | str | None = None,
         **kwargs: Any,
     ):
-        self.actor_learning_rate = as_schedule(actor_learning_rate, "actor_learning_rate")
-        if "learning_rate" in kwargs:
-            kwargs["learning_rate"] = as_schedule(kwargs["learning_rate"], "learning_rate")
+        self.actor_learning_rate: Any = actor_learning_rate
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             check_action_space(type(self).__name__, env.action_space, self.discrete)
@@ -69,6 +70,9 @@ class SettingsMixin(OffPolicyAlgorithm):
         cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
 
     def _setup_model(self) -> None:
+        # Here and not in the constructor, which what `load` is given passes by.
+        for name in self.schedules:
+            setattr(self, name, as_schedule(getattr(self, name), name))
         action_noise: Any = self.action_noise
         if isinstance(action_noise, Mapping):
             self.action_noise = make_action_noise(action_noise, self.action_space)
@@ -162,9 +166,9 @@ def as_schedule(value: Any, argument: str) -> Any:
 
     :param argument: the name of the constructor argument, for the error message
     """
-    if not isinstance(value, str):
+    if isinstance(value, Real) or callable(value) or (value is None and argument == "actor_learning_rate"):
         return value
-    if not re.fullmatch(LINEAR, value):
+    if not (isinstance(value, str) and re.fullmatch(LINEAR, value)):
         raise ValueError(f'`{argument}` must be a number, a schedule or "lin_<number>", but is {value!r}.')
     return LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
 

@@ -34,15 +34,16 @@ def stored(knowledge, part):
 
 
 class Oracle:
-    """Section 4.2 said with a list: when full, a tuple replaces the oldest of its class, else of the other."""
+    """Section 4.2 said with a list: when full, a tuple replaces the oldest of its class, if too few of the other."""
 
-    def __init__(self, capacity):
-        self.capacity, self.rows = capacity, []
+    def __init__(self, capacity, least):
+        self.capacity, self.least, self.rows = capacity, min(least, capacity // 2), []
 
     def add(self, number, label):
         if len(self.rows) == self.capacity:
             own = [row for row in self.rows if row[1] == label]
-            self.rows.remove(min(own or self.rows))
+            other = [row for row in self.rows if row[1] != label]
+            self.rows.remove(min(own if len(own) >= self.least else other))
         self.rows.append((number, label))
 
 
@@ -67,12 +68,18 @@ LABELS = st.one_of(
 
 
 @settings(max_examples=150, deadline=None)
-@given(size=st.integers(5, 24), fraction=st.sampled_from([0.3, 0.4, 0.5]), labels=LABELS, random=st.randoms())
-def test_eviction_equals_the_oracle(size, fraction, labels, random):
+@given(
+    size=st.integers(5, 24),
+    fraction=st.sampled_from([0.3, 0.4, 0.5]),
+    least=st.integers(1, 5),
+    labels=LABELS,
+    random=st.randoms(),
+)
+def test_eviction_equals_the_oracle(size, fraction, least, labels, random):
     to_validation = [random.random() < fraction for _ in labels]
-    knowledge = KnowledgeBuffer(BOX, 1, size, fraction, seed=0)
+    knowledge = KnowledgeBuffer(BOX, 1, size, fraction, 0, least)
     n_validation = round(size * fraction)
-    oracles = {"train": Oracle(size - n_validation), "validation": Oracle(n_validation)}
+    oracles = {"train": Oracle(size - n_validation, least), "validation": Oracle(n_validation, least)}
     ScriptedRng(knowledge, to_validation)
     for number, (label, validation) in enumerate(zip(labels, to_validation, strict=True)):
         add(knowledge, [number], [label])
@@ -101,6 +108,14 @@ def test_an_absent_class_takes_the_place_of_the_oldest_of_the_other():
     assert stored(knowledge, "train") == [(4, 1), (5, 1), (6, 1), (7, 1), (8, 0)]
     add(knowledge, [9], [True])
     assert stored(knowledge, "train") == [(5, 1), (6, 1), (7, 1), (8, 0), (9, 1)]
+
+
+def test_a_class_that_was_rare_when_the_store_filled_grows():
+    knowledge = KnowledgeBuffer(BOX, 1, 20, 0.5, min_per_class=3)
+    ScriptedRng(knowledge, [False] * 20)
+    add(knowledge, range(15), [True] * 15)
+    add(knowledge, range(15, 20), [False] * 5)
+    assert [number for number, label in stored(knowledge, "train") if label == 0] == [17, 18, 19]
 
 
 def test_samples_are_balanced_however_skewed_the_store_is():

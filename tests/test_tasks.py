@@ -1,5 +1,7 @@
 """AP functions beyond lane keeping, on transitions computed by hand and on the environments' own dynamics."""
 
+import math
+
 import gymnasium as gym
 import highway_env  # noqa: F401  registers its environments
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from sb3_sap import check_permissibility, tasks
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import algorithms, load_config
-from sb3_sap.tasks.driving import FAR, MISS_DISTANCE, least_distance, leaving_speed
+from sb3_sap.tasks.driving import FAR, approach_speed, passing_distance
 from sb3_sap.tasks.energy import acrobot_energy, flag_within_reach
 from sb3_sap.tasks.pendulum import energy as pendulum_energy_of
 
@@ -133,42 +135,45 @@ def parked(x, y, vx, vy, goal=(0.3, 0.0)):
 
 
 def test_parking():
-    assert leaving_speed(parked(0, 0, 1, 1)) == pytest.approx([-1.0])
-    away, faster, back = parked(0, 0, -0.5, 0), parked(0, 0, -1, 0), parked(0, 0, 0.5, 0)
-    assert tasks.parking(away, None, faster).tolist() == [False]
-    assert tasks.parking(faster, None, away).tolist() == [True]  # it brakes
-    assert tasks.parking(back, None, back).tolist() == [True]
-    near, near_faster = parked(0.25, 0, -0.5, 0), parked(0.25, 0, -1, 0)
-    assert tasks.parking(near, None, near_faster).tolist() == [True]
+    assert approach_speed(parked(0, 0, 1, 1)) == pytest.approx([1.0])
+    away, still, towards, aside = (parked(0, 0, *v) for v in ((-0.5, 0), (0, 0), (0.5, 0), (0, 0.5)))
+    assert tasks.parking(still, None, away).tolist() == [False]
+    assert tasks.parking(towards, None, aside).tolist() == [False]
+    assert tasks.parking(away, None, still).tolist() == [True]
+    assert tasks.parking(towards, None, towards).tolist() == [True]
+    # From 15 m/s no car stops within 20 m, from 10 m/s it does; within 10 m nothing is said.
+    assert tasks.parking(parked(0.1, 0, 3.2, 0), None, parked(0.1, 0, 3, 0)).tolist() == [True]
+    assert tasks.parking(parked(0.1, 0, 3.2, 0), None, parked(0.1, 0, 2, 0)).tolist() == [False]
+    assert tasks.parking(parked(0.25, 0, 0.5, 0), None, parked(0.25, 0, 0, 0)).tolist() == [True]
 
 
-def on_the_track(lat=0.0, *others):
-    """An observation with up to two other cars, (x, y, vx, vy) relative to the first in m and m/s."""
+def on_the_track(lat=0.0, *others, heading=0.0):
+    """An observation with up to two other cars, (x, y) relative to the first in m; the heading in rad."""
     obs = np.zeros((1, 3, 9), dtype=np.float32)
-    obs[0, 0, [0, 7]] = 1, lat / 2.5
+    obs[0, 0, [0, 5, 6, 7]] = 1, math.cos(heading), math.sin(heading), lat / 2.5
     for row, other in enumerate(others, 1):
         obs[0, row, 0] = 1
-        obs[0, row, 1:5] = np.array(other) / FAR
+        obs[0, row, 1:3] = np.array(other) / FAR
     return obs
 
 
-def test_least_distance():
-    assert least_distance(on_the_track()) == pytest.approx([np.inf])
-    # 20 m ahead, 10 m/s slower: met in 2 s, 3 m to the side.
-    assert FAR * least_distance(on_the_track(0, (20, 3, -10, 0))) == pytest.approx([3.0])
-    # 3 s later it is still 10 m off.
-    assert FAR * least_distance(on_the_track(0, (40, 0, -10, 0))) == pytest.approx([10.0])
-    # It drives away: the least distance is now. The nearer of two counts.
-    assert FAR * least_distance(on_the_track(0, (20, 0, 10, 0), (7, 0, 1, 0))) == pytest.approx([7.0])
+def test_passing_distance():
+    assert passing_distance(on_the_track()) == pytest.approx([np.inf])
+    assert FAR * passing_distance(on_the_track(0, (10, -3))) == pytest.approx([3.0])
+    # Turned by 30° to the right of the x-axis (y points down) the course passes 10 · sin 30° = 5 m away.
+    assert FAR * passing_distance(on_the_track(0, (10, 0), heading=math.pi / 6)) == pytest.approx([5.0], rel=1e-5)
+    # The nearer of two counts; those too far ahead or behind do not.
+    assert FAR * passing_distance(on_the_track(0, (10, 4), (-5, 2))) == pytest.approx([2.0])
+    assert passing_distance(on_the_track(0, (16, 0), (-7, 0))) == pytest.approx([np.inf])
 
 
 def test_racetrack():
-    assert 2 < MISS_DISTANCE * FAR < 5
-    hit, graze, clear = (on_the_track(0, (10, side, -10, 0)) for side in (0, 2, 4))
+    hit, graze, clear, far = (on_the_track(0, place) for place in ((10, 0), (10, 2), (10, 4.9), (16, 0)))
     assert tasks.racetrack(graze, None, hit).tolist() == [False]
     assert tasks.racetrack(hit, None, graze).tolist() == [True]
     assert tasks.racetrack(clear, None, graze).tolist() == [False]
-    # Without a collision course it is lane keeping; on one, the lane does not matter.
+    assert tasks.racetrack(far, None, hit).tolist() == [True]  # it only came into sight
+    # With nobody in the way it is lane keeping; else the lane does not matter.
     assert tasks.racetrack(on_the_track(0.5), None, on_the_track(1.0)).tolist() == [False]
     assert tasks.racetrack(on_the_track(1.0), None, on_the_track(0.5)).tolist() == [True]
     assert tasks.racetrack(on_the_track(0.0), None, on_the_track(0.2)).tolist() == [True]

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_sap.benchmark.tasks import Episode, make_env
+from sb3_sap.benchmark.tasks import Episode
+from sb3_sap.evaluation import make_env
 from sb3_sap.permissibility import APFunction, ask, resolve
 
 #: Actions of a box that are tried before the last one is taken, permissible or not.
@@ -32,7 +33,7 @@ def random_permissible(env_id: str, name: str, options: dict[str, Any], seeds: l
     rng = np.random.default_rng(seed)
     rows = []
     for number in seeds:
-        env = make_env(env_id, options)
+        env = make_env(env_id, **options)
         episode = Episode(env, int(number))
         while not episode.done:
             episode.step(_choose(env, episode.obs, ap_function, rng))

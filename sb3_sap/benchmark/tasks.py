@@ -6,7 +6,6 @@ The "tracks" of such a cell are the seeds of its evaluation episodes, the score 
 from __future__ import annotations
 
 import copy
-import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.errors import nearest
+from sb3_sap.evaluation import make_env
 from sb3_sap.permissibility import APFunction, ask, resolve
 from sb3_sap.presets import algorithms, load_config, settings_in
 
@@ -90,18 +90,11 @@ def evaluations(steps: int) -> list[int]:
     return sorted({*range(steps // TIMES, steps, max(1, steps // TIMES)), steps} - {0})
 
 
-def make_env(env_id: str, options: dict[str, Any]) -> gym.Env[Any, Any]:
-    """Makes the environment; highway-env registers its own when it is imported."""
-    if env_id not in gym.registry:
-        importlib.import_module("highway_env")
-    return gym.make(env_id, **options)
-
-
 def evaluation(env_id: str, algo: str, options: dict[str, Any], seeds: list[str]) -> Callable[[Any], list[list[Any]]]:
     """A function that evaluates a policy deterministically: rows that follow the checkpoint in ``RETURN_COLUMNS``."""
     name = entry(algo, env_id).get("ap_function")
     ap_function = None if name is None else resolve(name, "ap_function")
-    envs = [make_env(env_id, options) for _ in seeds]
+    envs = [make_env(env_id, **options) for _ in seeds]
 
     def evaluate(policy: Any) -> list[list[Any]]:
         episodes = [Episode(env, int(seed)) for env, seed in zip(envs, seeds, strict=True)]

@@ -16,9 +16,9 @@ from sb3_sap.benchmark.cells import Cell
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.rule import random_permissible
-from sb3_sap.benchmark.tasks import RETURN_COLUMNS, evaluation, make_env
+from sb3_sap.benchmark.tasks import RETURN_COLUMNS, evaluation
 from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD
-from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env
+from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env, make_env
 
 #: Steps between two points of a curve, and steps over which its reward is averaged (Fig. 4a).
 INTERVAL, WINDOW = 25, 100
@@ -74,11 +74,11 @@ class Recorder(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # The gradient steps of the last rollout have been taken by now; in `_on_step` they have not.
-        if self._due and self.num_timesteps >= self._due[0]:
+        while self._due and self.num_timesteps >= self._due[0]:
             self._checkpoint()
 
     def _on_training_end(self) -> None:
-        if self._due:
+        while self._due:
             self._checkpoint()
         if self._length:
             self._end_episode("unfinished")
@@ -141,7 +141,7 @@ def run_cell(cell: Cell, began: float) -> dict[str, Any]:
         played = random_permissible(cell.simulator, cell.settings["ap_function"], cell.training, cell.tracks, cell.seed)
         recorder.laps = [[0, *row] for row in played]
     else:
-        env = make_env(ENVIRONMENTS.get(cell.simulator, cell.simulator), cell.training)
+        env = make_env(ENVIRONMENTS.get(cell.simulator, cell.simulator), **cell.training)
         model = make_model(cell.algo, env, cell.settings, cell.seed)
         model.learn(cell.steps, callback=recorder)
     return {

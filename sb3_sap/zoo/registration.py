@@ -55,7 +55,7 @@ def small_buffers() -> Iterator[None]:
 def _watching(algorithm: type[OffPolicyAlgorithm]) -> type[OffPolicyAlgorithm]:
     small: dict[str, Any] = {"buffer_size": 1, "optimize_memory_usage": False}
     if issubclass(algorithm, ActionPermissibilityMixin):
-        small |= {"knowledge_buffer_size": 20, "min_per_class": 1}
+        small |= {"knowledge_buffer_size": 20, "validation_fraction": 0.5, "min_per_class": 1}
 
     def load(cls: type, *args: Any, **kwargs: Any) -> OffPolicyAlgorithm:
         return algorithm.load(*args, **kwargs | small)

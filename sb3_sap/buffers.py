@@ -98,7 +98,7 @@ def reaches_clip(env: VecNormalize, observation: Any) -> bool:
     """Whether a normalised observation may have been clipped, so that the raw one cannot be had back."""
     if not env.norm_obs:
         return False
-    parts = [observation[key] for key in env.norm_obs_keys] if isinstance(observation, dict) else [observation]
+    parts = [observation[key] for key in env.norm_obs_keys or ()] if isinstance(observation, dict) else [observation]
     return any((np.abs(part) >= env.clip_obs).any() for part in parts)
 
 

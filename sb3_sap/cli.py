@@ -12,7 +12,7 @@ from rich.console import Console
 from sb3_sap import __version__, zoo
 from sb3_sap.benchmark.cli import add_benchmark
 from sb3_sap.envs.torcs.cli import add_torcs
-from sb3_sap.errors import run_command
+from sb3_sap.errors import positive, run_command
 from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.hub import add_push_to_hub
 
@@ -61,7 +61,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     command.add_argument(
         "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
     )
-    command.add_argument("--steps", type=_positive, default=default.steps, help="training steps")
+    command.add_argument("--steps", type=positive, default=default.steps, help="training steps")
     command.add_argument("--seed", type=int, default=default.seed, help="seed of everything random")
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
     _add_simulator(command)
@@ -107,13 +107,6 @@ def _evaluate(options: argparse.Namespace, console: Console) -> int:
 
 def _add_simulator(command: argparse.ArgumentParser) -> None:
     command.add_argument("--simulator", choices=list(ENVIRONMENTS), default="highway", help="what the car drives on")
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be 1 or more, but is {number}")
-    return number
 
 
 if __name__ == "__main__":

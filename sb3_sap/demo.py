@@ -27,6 +27,7 @@ from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
 from sb3_sap.envs import TRACKS, CarState
 from sb3_sap.evaluation import ENVIRONMENTS, LapResult, drive_lap, write_results
 from sb3_sap.files import atomic_path
+from sb3_sap.hub import EXTRAS
 from sb3_sap.presets import preset, preset_names
 
 #: km/h, the default speed of the task.
@@ -117,11 +118,15 @@ def demo(run: Run, console: Console) -> list[LapResult]:
             )
             model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
     finally:
-        # Ctrl-C included: what was learned so far stays.
+        # Ctrl-C included: what was learned so far stays, but not what an earlier run left of another model.
+        for name in EXTRAS:
+            (run.out / name).unlink(missing_ok=True)
         with atomic_path(run.out / "model.zip") as temporary:
             model.save(temporary)
         with atomic_path(run.out / "run.json") as temporary:
-            described = {**asdict(run), "out": str(run.out), "command": run.command}
+            taken = len(log.rows)
+            command = run.command if taken >= run.steps else f"{run.command}  # interrupted after {taken} steps"
+            described = {**asdict(run), "out": str(run.out), "command": command}
             temporary.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
         training = pd.DataFrame(log.rows)
         with atomic_path(run.out / "training.csv") as temporary:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import sys
 from collections.abc import Callable, Iterable
+
+from gymnasium.error import Error as EnvironmentProblem
 
 
 def run_command(command: Callable[[], int]) -> int:
@@ -14,9 +17,17 @@ def run_command(command: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("sb3-sap: interrupted; what was written so far is kept.", file=sys.stderr)
         return 130
-    except (ValueError, TypeError, OSError, RuntimeError, ImportError) as error:
+    except (ValueError, TypeError, OSError, RuntimeError, ImportError, EnvironmentProblem) as error:
         print(f"sb3-sap: error: {error}", file=sys.stderr)
         return 1
+
+
+def positive(text: str) -> int:
+    """A flag's value that must be a whole number of 1 or more."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be 1 or more, but is {number}")
+    return number
 
 
 def nearest(value: object, known: Iterable[str]) -> str:

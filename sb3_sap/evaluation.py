@@ -26,11 +26,11 @@ ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0", "torcs": "sap/TorcsLaneKeeping-
 
 def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
     """``gym.make``, which finds highway-env's tasks as well."""
-    register(env_id)
+    find_environment(env_id)
     return gym.make(env_id, **options)
 
 
-def register(env_id: str) -> None:
+def find_environment(env_id: str) -> None:
     """Has highway-env register its tasks, which it does when it is imported, if the environment is not known yet."""
     if env_id not in gym.registry:
         importlib.import_module("highway_env")

@@ -20,7 +20,7 @@ from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import FloatArray
 from sb3_sap.prediction import guided_prediction
 from sb3_sap.predictor import candidate_logits, flush_denormals
-from sb3_sap.settings import SettingsMixin
+from sb3_sap.settings import SettingsMixin, check_at_least
 
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
@@ -71,10 +71,12 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     def _setup_model(self) -> None:
         for name in ("alpha", "alpha_low"):
             probability = getattr(self, name)
-            if not (isinstance(probability, Real) and 0 <= probability <= 1):
+            if not (isinstance(probability, Real) and 0 <= float(probability) <= 1):
                 raise ValueError(f"`{name}` is a probability from 0 to 1, but is {probability!r}.")
-        if self.t_k is not None and self.t_k < 0:
-            raise ValueError(f"`t_k` is a number of steps, 0 or more, but is {self.t_k}.")
+        if self.t_k is not None:
+            check_at_least(self, t_k=0)
+        if self.guidance_end is not None:
+            check_at_least(self, guidance_end=0)
         if self.guidance_end is not None and self.guidance_end <= self.noise_steps:
             warnings.warn(
                 f"`guidance_end` = {self.guidance_end} leaves no step to guidance, which begins after "

@@ -6,14 +6,16 @@ import argparse
 import json
 import shlex
 import shutil
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
 from rich.console import Console
 
 from sb3_sap import __version__
-from sb3_sap.errors import nearest
+from sb3_sap.errors import nearest, positive
 from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.files import atomic_path
 
@@ -63,6 +65,7 @@ class Trained:
     env_id: str
     command: str
     laps: tuple[dict[str, Any], ...] = ()  # the rows of evaluation.json
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
 
 def find_trained(path: Path, algo: str | None, env_id: str | None, command: str | None) -> Trained:
@@ -90,11 +93,11 @@ def find_trained(path: Path, algo: str | None, env_id: str | None, command: str 
         raise ValueError(f"{model} does not say how it was made: add {' and '.join(missing)}.")
     if given["algo"] not in ALGORITHMS:
         raise ValueError(f"--algo {given['algo']!r} is unknown: {nearest(given['algo'], ALGORITHMS)}")
-    return Trained(model, given["algo"], given["env"], given["command"], tuple(laps))
+    return Trained(model, given["algo"], given["env"], given["command"], tuple(laps), run.get("env_kwargs", {}))
 
 
-def _zoo_run(folder: Path) -> dict[str, str]:
-    """What RL Zoo's training says of itself in `ENV_ID/command.txt`: model, algo, env and command, or nothing."""
+def _zoo_run(folder: Path) -> dict[str, Any]:
+    """What RL Zoo's training says of itself in `ENV_ID/`: model, algo, env and its options, command; or nothing."""
     found = next(folder.glob("*/command.txt"), None)
     if found is None:
         return {}
@@ -112,7 +115,18 @@ def _zoo_run(folder: Path) -> dict[str, str]:
     words[:2] = ["python", "-m"] if words[1] == "-m" else [Path(words[1]).name]
     best = folder / "best_model.zip"
     model = best.name if best.is_file() else f"{found.parent.name}.zip"
-    return {"model": model, "algo": named.algo, "env": named.env, "command": shlex.join(words)}
+    return {"model": model, "algo": named.algo, "env": named.env, "command": shlex.join(words)} | {
+        "env_kwargs": _zoo_env_kwargs(found.parent)
+    }
+
+
+def _zoo_env_kwargs(folder: Path) -> dict[str, Any]:
+    """Options of the environment that the run's entry or command line gave, but for the laps."""
+    saved: dict[str, Any] = {}
+    for name in ("config.yml", "args.yml"):  # RL Zoo's own files, with Python objects in them
+        told = dict(yaml.unsafe_load((folder / name).read_text(encoding="utf-8"))).get("env_kwargs")
+        saved = saved if told is None else dict(told)
+    return {name: value for name, value in saved.items() if name != "laps"}
 
 
 def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) -> list[Path]:
@@ -181,13 +195,12 @@ def _laps(trained: Trained) -> tuple[str, str, str]:
 
 
 def _episodes(trained: Trained, n: int) -> tuple[str, str, str]:
-    import gymnasium as gym
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.monitor import Monitor
 
-    from sb3_sap.evaluation import load_policy
+    from sb3_sap.evaluation import load_policy, make_env
 
-    env = Monitor(gym.make(trained.env_id))
+    env = Monitor(make_env(trained.env_id, **trained.env_kwargs))
     env.reset(seed=0)
     mean, deviation = evaluate_policy(load_policy(trained.model), env, n)
     env.close()
@@ -212,7 +225,7 @@ def add_push_to_hub(commands: argparse._SubParsersAction[argparse.ArgumentParser
     command.add_argument("--algo", help="the algorithm, where the folder does not say it")
     command.add_argument("--env", help="the environment's id, the same")
     command.add_argument("--command", help="the command that trained the model, the same")
-    command.add_argument("--episodes", type=int, default=10, help="to evaluate where there are no laps (10)")
+    command.add_argument("--episodes", type=positive, default=10, help="to evaluate where there are no laps (10)")
     command.add_argument("--out", type=Path, help="where to write what is uploaded; `hub` beside the model")
     command.add_argument("--dry-run", action="store_true", help="write it, and upload nothing")
     command.set_defaults(run=_push_to_hub)

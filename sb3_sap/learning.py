@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -73,9 +74,10 @@ class LearnedPermissibilityMixin(SettingsMixin):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        check_at_least(self, min_per_class=1, dataset_size=2, validation_size=2)
-        if not 0 <= self.refit_growth < 1:
-            raise ValueError(f"`refit_growth` is a share from 0 to below 1, but is {self.refit_growth!r}.")
+        check_at_least(self, knowledge_buffer_size=4, min_per_class=1, dataset_size=2, validation_size=2)
+        growth: Any = self.refit_growth
+        if not (isinstance(growth, Real) and 0 <= float(growth) < 1):
+            raise ValueError(f"`refit_growth` is a share from 0 to below 1, but is {growth!r}.")
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.

@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from io import BufferedIOBase
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
 
@@ -155,10 +155,11 @@ def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool)
 
 
 def check_at_least(model: Any, **minima: int) -> None:
-    """Refuses settings of a model that are too small."""
+    """Refuses settings of a model that are no whole numbers, or too small."""
     for name, minimum in minima.items():
-        if getattr(model, name) < minimum:
-            raise ValueError(f"`{name}` must be at least {minimum}, but is {getattr(model, name)}.")
+        value = getattr(model, name)
+        if not isinstance(value, Integral) or value < minimum:
+            raise ValueError(f"`{name}` must be a whole number of at least {minimum}, but is {value!r}.")
 
 
 def as_schedule(value: Any, argument: str) -> Any:

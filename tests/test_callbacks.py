@@ -82,6 +82,12 @@ def test_the_callback_asks_how_many_fits_are_due():
     assert set(callback.validations) <= set(callback.fits)
 
 
+def test_fits_become_rarer_over_the_whole_life():
+    model, callback = build(DDPGAP, refit_growth=0.1, min_per_class=1), Recorder()
+    model.learn(100).learn(100, callback=callback)
+    assert len(callback.fits) == model.refits_due(100, 200) == 6  # 10·ln 2 is 6.9
+
+
 def test_nothing_is_fitted_before_each_class_has_its_minimum():
     callback = Recorder()
     labels = iter([True] * 10 + [False] * 30)

@@ -14,6 +14,7 @@ from PIL import Image
 
 from sb3_sap import DDPGAP
 from sb3_sap.cli import main
+from sb3_sap.hub import EXTRAS
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,8 @@ def test_help(command, capsys):
 
 def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     command = [sys.executable, "-m", "sb3_sap.cli", "demo", "--steps", "100000", "--out", str(tmp_path)]
+    for name in EXTRAS:  # of another model
+        (tmp_path / name).write_text("old")
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
     assert "learns 100,000 steps" in process.stdout.readline()
     time.sleep(3)
@@ -98,4 +101,8 @@ def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in error
     assert DDPGAP.load(tmp_path / "model.zip").num_timesteps > 0
-    assert len(pd.read_csv(tmp_path / "training.csv")) > 0
+    taken = len(pd.read_csv(tmp_path / "training.csv"))
+    assert taken > 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.zip", "run.json", "training.csv"]
+    command = json.loads((tmp_path / "run.json").read_text())["command"]
+    assert command.endswith(f"# interrupted after {taken} steps")

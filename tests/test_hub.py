@@ -8,6 +8,7 @@ from toy import build
 
 from sb3_sap import DDPGAP
 from sb3_sap.cli import main
+from sb3_sap.hub import find_trained, prepare
 
 LAPS = [
     {"track": "eroad", "lap_done": True, "covered": 1.0, "total_reward": 1.0, "score": 0.9, "steps": 1},
@@ -42,6 +43,10 @@ def uploads(monkeypatch):
         HfApi, "upload_file", lambda api, *, path_in_repo, repo_id, **kwargs: calls.append((path_in_repo, repo_id))
     )
     return calls
+
+
+#: How RL Zoo writes what a run was given.
+SAVED = "!!python/object/apply:collections.OrderedDict\n- - - {}\n    - {}\n"
 
 
 def push(*arguments):
@@ -83,7 +88,18 @@ def zoo_run(tmp_path):
         "/home/me/bin/python3 /home/me/bin/sb3-sap train --algo=ddpg --env Pendulum-v1 "
         "-params gamma:0.9 policy_kwargs:dict(net_arch=[4])"
     )
+    (folder / "Pendulum-v1" / "args.yml").write_text(SAVED.format("env_kwargs", "null"))
+    (folder / "Pendulum-v1" / "config.yml").write_text(SAVED.format("env_kwargs", "{g: 9.81, laps: null}"))
     return folder
+
+
+def test_it_is_evaluated_with_the_options_of_its_run(zoo_run):
+    assert find_trained(zoo_run, None, None, None).env_kwargs == {"g": 9.81}
+    (zoo_run / "Pendulum-v1" / "args.yml").write_text(SAVED.format("env_kwargs", "{g: 5}"))
+    assert find_trained(zoo_run, None, None, None).env_kwargs == {"g": 5}
+    (zoo_run / "Pendulum-v1" / "args.yml").write_text(SAVED.format("env_kwargs", "{gravity: 5}"))
+    with pytest.raises(TypeError, match="gravity"):
+        prepare(find_trained(zoo_run, None, None, None), "me/p", zoo_run / "hub", 1)
 
 
 def test_a_run_of_the_zoo_says_everything_by_itself(zoo_run):
@@ -130,6 +146,12 @@ def test_what_cannot_be_pushed_is_told(run, uploads, capsys, arguments, sentence
     assert push(run, *arguments) == 1
     assert sentence in capsys.readouterr().err
     assert uploads == []
+
+
+def test_an_unknown_environment_cannot_be_evaluated(run, uploads, capsys):
+    (run / "evaluation.json").unlink()
+    assert push(run, "--repo-id", "me/car", "--env", "Pendulum-v9") == 1
+    assert "Pendulum" in capsys.readouterr().err
 
 
 def test_what_a_file_does_not_say_is_asked_for(run, uploads, capsys):

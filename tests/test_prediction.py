@@ -38,6 +38,30 @@ def test_a_rejected_action_moves_to_the_nearest_permissible_candidate():
     np.testing.assert_array_equal(actions, model.predict(OBS, guided=True)[0])
 
 
+def test_others_in_a_batch_change_nothing():
+    model = predicting(above(0.5), env=Line(dim=2), n_candidates=20)
+    batch = np.repeat(OBS, 3, axis=0)
+    alone = [model.predict(obs, deterministic=True, guided=True)[0] for obs in batch]
+    np.testing.assert_array_equal(model.predict(batch, deterministic=True, guided=True)[0], alone)
+
+
+def test_raw_observations_cannot_be_had_without_their_statistics(tmp_path):
+    asked = []
+
+    def rule(obs, actions):
+        asked.append(obs)
+        return np.ones(len(actions), dtype=bool)
+
+    env = VecNormalize(DummyVecEnv([Line]))
+    build(DDPGAP, env, permissible_actions=rule).learn(30).save(tmp_path / "model")
+    asked.clear()
+    with pytest.raises(ValueError, match=r"load\(path, env=...\)"):
+        DDPGAP.load(tmp_path / "model").predict(OBS, guided=True)
+    model = DDPGAP.load(tmp_path / "model", env=env, permissible_actions=rule)
+    model.predict(env.normalize_obs(OBS), guided=True)
+    np.testing.assert_allclose(asked[-1][[0, -1]], OBS, atol=1e-5)
+
+
 def test_a_permissible_action_is_the_actors_own_to_the_bit():
     model = predicting(above(0.0), 0.3)
     np.testing.assert_array_equal(model.predict(OBS, guided=True)[0], model.predict(OBS)[0])

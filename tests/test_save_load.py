@@ -120,6 +120,25 @@ def test_load_for_another_number_of_environments(tmp_path):
     assert model.replay_buffer.actions.shape[1] == 3
 
 
+@pytest.mark.parametrize("value", ["lin_0.001", 0.001])
+@pytest.mark.parametrize("name", ["learning_rate", "actor_learning_rate", "actor_permissibility_coef"])
+def test_schedules_can_be_given_to_load_too(name, value, tmp_path):
+    build(DDPGAP).learn(20).save(tmp_path / "model")
+    model = DDPGAP.load(tmp_path / "model", env=Line(), **{name: value})
+    schedule = getattr(model, name)
+    assert schedule == 0.001 if value == 0.001 else schedule(0.5) == pytest.approx(0.0005)
+    model.learn(20)
+    with pytest.raises(ValueError, match=f"`{name}` must be a number, a schedule or"):
+        DDPGAP.load(tmp_path / "model", **{name: "falling"})
+
+
+def test_another_return_can_be_loaded(tmp_path):
+    build(DDPGAP, n_steps=4, gamma=0.8).learn(20).save(tmp_path / "model")
+    for n_steps in (1, 2):
+        buffer = DDPGAP.load(tmp_path / "model", n_steps=n_steps, gamma=0.5).replay_buffer
+        assert (buffer.n_steps, buffer.gamma) == (n_steps, 0.5)
+
+
 def test_an_n_step_model_stays_one(tmp_path):
     build(DDPGAP, n_steps=4, gamma=0.8).save(tmp_path / "model")
     buffer = DDPGAP.load(tmp_path / "model").replay_buffer

@@ -248,7 +248,7 @@ def optimize(*flags):
 
 
 @pytest.mark.slow
-def test_optimize_replay_retest():
+def test_optimize_replay_retest(capsys):
     where = ["--storage", "study.log"]
     assert optimize(*where, "--max-total-trials", "4", "--n-startup-trials", "2", "--n-evaluations", "3") == 0
     study = optuna.load_study(study_name="study", storage=open_storage("study.log"))
@@ -279,9 +279,12 @@ def test_optimize_replay_retest():
     assert f"| trial {study.best_trial.number} |" in table
     rows = Path("retest/retest.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * 2
-    assert rows[1].startswith("default,10000,wheel-2,")
+    assert rows[1].startswith("default,10000,60,wheel-2,")
     assert main(command) == 0  # what is there is not trained again
     assert Path("retest/retest.csv").read_text().splitlines() == rows
+    command[command.index("wheel-2")] = "eroad"
+    assert main(command) == 1
+    assert "holds runs of 60 steps on wheel-2" in capsys.readouterr().err
 
     assert main(["plot", "study", *where, "--study-name", "study", "--out", "drawn"]) == 0
     assert Path("drawn/report.md").exists()
@@ -345,6 +348,17 @@ def test_help_tells_ours_and_theirs(capsys):
     text = capsys.readouterr().out
     assert "--guidance-only" in text
     assert "--n-startup-trials" in text
+
+
+@pytest.mark.slow
+def test_the_options_of_an_entry_hold_for_evaluations_and_films():
+    # Without them racetrack-v0 has other observations. The share for validation is one that few examples cannot have.
+    which = ["--algo", "sac_ap", "--env", "racetrack-v0"]
+    command = ["train", *which, "-n", "60", "--eval-freq", "40", "--eval-episodes", "1"]
+    assert main([*command, "-params", "validation_fraction:0.05", "learning_starts:60"]) == 0
+    assert main(["enjoy", *which, "--folder=logs", "--no-render", "-n", "20"]) == 0
+    assert main(["record-video", *which, "-n", "20"]) == 0
+    assert list(Path("logs").rglob("*.mp4"))
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from sb3_sap.benchmark.paper import TEST_TRACKS
+from sb3_sap.errors import positive
 from sb3_sap.evaluation import ENVIRONMENTS
 
 if TYPE_CHECKING:
@@ -78,17 +79,17 @@ def _add_grid(command: argparse.ArgumentParser, steps: bool = True, lane_keeping
     if lane_keeping:
         command.add_argument("--simulator", choices=list(ENVIRONMENTS), default="torcs", help="what the car drives on")
     else:
-        command.add_argument("--steps", type=_positive, help="training steps; None: those of the guided entry")
+        command.add_argument("--steps", type=positive, help="training steps; None: those of the guided entry")
     if steps and lane_keeping:
-        command.add_argument("--steps", type=_positive, default=3_000, help="training steps")
+        command.add_argument("--steps", type=positive, default=3_000, help="training steps")
         command.add_argument("--tracks", nargs="+", default=list(TEST_TRACKS), metavar="TRACK", help="unseen tracks")
-    command.add_argument("--seeds", type=_positive, default=10, metavar="N", help="training runs of each column")
+    command.add_argument("--seeds", type=positive, default=10, metavar="N", help="training runs of each column")
     command.add_argument("--first-seed", type=int, default=0, metavar="SEED", help="100 and up to choose settings")
     command.add_argument("--out", type=Path, default=Path("docs/results"), help="holds a folder of each grid")
 
 
 def _add_workers(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--jobs", type=_positive, default=1, metavar="N", help="runs side by side on this machine")
+    command.add_argument("--jobs", type=positive, default=1, metavar="N", help="runs side by side on this machine")
     command.add_argument("--backend", choices=["local", "dask"], default="local", help="dask: on a cluster")
     command.add_argument("--scheduler", metavar="ADDRESS", help="of the Dask cluster")
 
@@ -227,10 +228,3 @@ def command_line(options: argparse.Namespace, name: str) -> str:
     words += ["--columns", *options.columns] if options.columns != default else []
     words += ["--tracks", *options.tracks] if not task and options.tracks != list(TEST_TRACKS) else []
     return shlex.join(words)
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be 1 or more, but is {number}")
-    return number

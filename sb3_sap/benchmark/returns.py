@@ -14,7 +14,7 @@ from sb3_sap.benchmark.figures import line_figure
 from sb3_sap.benchmark.measures import median_reached
 from sb3_sap.benchmark.pages import markdown, write_csv, write_figure, write_page
 from sb3_sap.benchmark.results import Results
-from sb3_sap.evaluation import register
+from sb3_sap.evaluation import find_environment
 from sb3_sap.permissibility import FloatArray
 from sb3_sap.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
 
@@ -31,7 +31,7 @@ def returns(results: Results, folder: Path, command: str) -> None:
     write_csv(folder / "returns.csv", results.laps.drop(columns="score").rename(columns={"track": "episode"}))
     runs = mean_returns(results.laps)
     write_figure(folder / "returns", _figure(runs, results))
-    register(results.simulator)
+    find_environment(results.simulator)
     spec = gym.spec(results.simulator)
     table = pd.DataFrame([_row(results, runs, name, spec.reward_threshold) for name in results.names])
     improvements = improvement(runs, results)

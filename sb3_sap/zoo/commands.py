@@ -13,11 +13,12 @@ import rl_zoo3.enjoy
 import rl_zoo3.train
 import rl_zoo3.utils
 
+from sb3_sap.evaluation import find_environment
 from sb3_sap.zoo.arguments import NamedStoreDict, command_line
 from sb3_sap.zoo.configs import check_algo
 from sb3_sap.zoo.options import StudyOptions, study_parser
 from sb3_sap.zoo.plotting import plot
-from sb3_sap.zoo.registration import register, small_buffers
+from sb3_sap.zoo.registration import register, saved_env_options, small_buffers
 from sb3_sap.zoo.retest import RetestManager
 from sb3_sap.zoo.storages import load_study
 from sb3_sap.zoo.tuning import StudyManager
@@ -34,6 +35,9 @@ def run(arguments: list[str]) -> int:
         known = ", ".join(RUNNERS)
         raise ValueError(f"{f'{arguments[0]!r} is no command' if arguments else 'A command is missing'}: {known}.")
     register()
+    env_id = _given(arguments[1:]).env
+    if env_id:
+        find_environment(env_id)
     try:
         RUNNERS[arguments[0]](arguments[0], arguments[1:])
     except AssertionError as error:
@@ -75,18 +79,19 @@ def _with_defaults(command: str, rest: list[str], given: Namespace) -> list[str]
 def _given(rest: list[str]) -> Namespace:
     """Those of RL Zoo's flags that have to be known beforehand."""
     parser = ArgumentParser(prog="sb3-sap", usage="sb3-sap COMMAND [flags]", add_help=False, allow_abbrev=False)
-    for flag in ("--algo", "--storage", "--study-name"):
+    for flag in ("--algo", "--env", "--storage", "--study-name"):
         parser.add_argument(flag)
     for flag in ("--seed", "--trial-id"):
         parser.add_argument(flag, type=int)
+    parser.add_argument("-f", "--folder")
     return parser.parse_known_args(rest)[0]
 
 
 def _watch(command: str, arguments: list[str]) -> None:
-    algo = _given(arguments).algo
-    check_algo(algo or DEFAULT_ALGO)
-    arguments = arguments if algo else [*arguments, "--algo", DEFAULT_ALGO]
-    if not any(argument in ("-f", "--folder") for argument in arguments):
+    given = _given(arguments)
+    check_algo(given.algo or DEFAULT_ALGO)
+    arguments = arguments if given.algo else [*arguments, "--algo", DEFAULT_ALGO]
+    if given.folder is None:
         arguments = [*arguments, "-f", LOGS]  # where `train` leaves its runs; rl_zoo3's own agents are elsewhere
     zoo: Any = rl_zoo3.enjoy
     zoo.StoreDict = rl_zoo3.utils.StoreDict = NamedStoreDict  # type: ignore[misc]
@@ -94,7 +99,8 @@ def _watch(command: str, arguments: list[str]) -> None:
         if command == "enjoy":
             zoo.enjoy()
         else:
-            runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
+            with saved_env_options():
+                runpy.run_module("rl_zoo3.record_video", run_name="__main__")  # it has no function to call
 
 
 RUNNERS: dict[str, Callable[[str, list[str]], None]] = {

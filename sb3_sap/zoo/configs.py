@@ -65,6 +65,11 @@ def check_file(path: str) -> None:
             raise ValueError(f"{path}: the environment {name!r} is unknown: {nearest(name, ours)}")
 
 
+def evaluation_options(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of the environment in evaluations: the entry's, but on the laps that the environment has by itself."""
+    return {name: value for name, value in hyperparams.get("env_kwargs", {}).items() if name != "laps"}
+
+
 def check_hyperparameters(algo: str, hyperparams: Mapping[str, Any], source: str) -> None:
     """Refuses keys that neither rl_zoo3 nor the algorithm knows, and values of a type that cannot be."""
     algorithm: Any = ALGOS[algo]

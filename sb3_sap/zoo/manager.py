@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sap.exploration import ActionPermissibilityMixin
-from sb3_sap.zoo.configs import check_file, check_hyperparameters, packaged
+from sb3_sap.zoo.configs import check_file, check_hyperparameters, evaluation_options, packaged
 from sb3_sap.zoo.storages import SeededByTrial, check_belongs, load_study
 
 
@@ -63,6 +63,9 @@ class GuidedExperimentManager(ExperimentManager):
         check_file(self.config)
         hyperparams, saved = super().read_hyperparameters()
         check_hyperparameters(self.algo, hyperparams, Path(self.config).name)
+        # It evaluates on the environment without the options of its entry, where the spaces may be others.
+        if not self._eval_env_kwargs_args and not self.env_kwargs:
+            self.eval_env_kwargs = evaluation_options(hyperparams)
         return hyperparams, saved
 
     def load_trial(

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import rl_zoo3.utils
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.zoo.configs import evaluation_options
 from sb3_sap.zoo.spaces import (
     convert_crossq_params,
     guided_converter,
@@ -50,6 +52,22 @@ def small_buffers() -> Iterator[None]:
         yield
     finally:
         ALGOS.update(before)
+
+
+@contextmanager
+def saved_env_options() -> Iterator[None]:
+    """Lets rl_zoo3's `record_video` make the environment with the options of the run's entry, as its `enjoy` does."""
+    make: Any = rl_zoo3.utils.create_test_env
+
+    def make_with_options(*args: Any, **kwargs: Any) -> Any:
+        given = kwargs.pop("env_kwargs", None) or {}
+        return make(*args, env_kwargs={**evaluation_options(kwargs["hyperparams"]), **given}, **kwargs)
+
+    rl_zoo3.utils.create_test_env = make_with_options
+    try:
+        yield
+    finally:
+        rl_zoo3.utils.create_test_env = make
 
 
 def _watching(algorithm: type[OffPolicyAlgorithm]) -> type[OffPolicyAlgorithm]:

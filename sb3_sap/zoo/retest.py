@@ -49,18 +49,33 @@ class RetestManager(StudyManager):
 
     def _train_all(self, settings: dict[str, dict[str, Any]], path: Path) -> pd.DataFrame:
         """One row for each run and track; what the file holds already is not trained again."""
-        rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["arm", "seed", "task", "score"])
+        rows = self._rows_of(path)
         for seed in range(self.seed, self.seed + self.options.runs):  # seed by seed, so that a part is a comparison too
             for arm, hyperparams in settings.items():
                 if ((rows["arm"] == arm) & (rows["seed"] == seed)).any():
                     continue
                 scores = self._train(hyperparams, seed)
                 print(f"{arm}, seed {seed}: {np.mean(scores):.4g}", flush=True)
+                run = {"arm": arm, "seed": seed, "steps": int(self.n_timesteps)}
                 tasks = self.options.validation_tracks or [self.env_name.gym_id] * len(scores)
-                new = [{"arm": arm, "seed": seed, "task": t, "score": s} for t, s in zip(tasks, scores, strict=True)]
+                new = [run | {"task": task, "score": score} for task, score in zip(tasks, scores, strict=True)]
                 rows = pd.DataFrame([*rows.to_dict("records"), *new])
                 with atomic_path(path) as temporary:
                     rows.to_csv(temporary, index=False)
+        return rows
+
+    def _rows_of(self, path: Path) -> pd.DataFrame:
+        """What the file holds, if it is of the same steps and tracks: others cannot be compared."""
+        if not path.exists():
+            return pd.DataFrame(columns=["arm", "seed", "steps", "task", "score"])
+        rows = pd.read_csv(path)
+        tasks = self.options.validation_tracks or [self.env_name.gym_id]
+        if set(rows["steps"]) - {int(self.n_timesteps)} or set(rows["task"]) - set(tasks):
+            raise ValueError(
+                f"{path} holds runs of {', '.join(map(str, sorted(set(rows['steps']))))} steps on "
+                f"{', '.join(sorted(set(rows['task'])))}, which are not to be compared with runs of {self.n_timesteps} "
+                f"on {', '.join(tasks)}: give another `--out`."
+            )
         return rows
 
     def _train(self, hyperparams: dict[str, Any], seed: int) -> list[float]:

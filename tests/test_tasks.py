@@ -1,7 +1,5 @@
 """AP functions beyond lane keeping, on transitions computed by hand and on the environments' own dynamics."""
 
-import math
-
 import gymnasium as gym
 import highway_env  # noqa: F401  registers its environments
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 from sb3_sap import check_permissibility, tasks
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import algorithms, load_config
-from sb3_sap.tasks.driving import FAR, approach_speed, passing_distance
+from sb3_sap.tasks.driving import SCALES, approach_speed, passing_distance
 from sb3_sap.tasks.energy import acrobot_energy, flag_within_reach
 from sb3_sap.tasks.pendulum import energy as pendulum_energy_of
 
@@ -147,38 +145,46 @@ def test_parking():
     assert tasks.parking(parked(0.25, 0, 0.5, 0), None, parked(0.25, 0, 0, 0)).tolist() == [True]
 
 
-def on_the_track(lat=0.0, *others, heading=0.0):
-    """An observation with up to two other cars, (x, y) relative to the first in m; the heading in rad."""
-    obs = np.zeros((1, 3, 9), dtype=np.float32)
-    obs[0, 0, [0, 5, 6, 7]] = 1, math.cos(heading), math.sin(heading), lat / 2.5
+def on_the_road(y, vy, *others):
+    """An observation of a car at y m, at vy m/s, and up to two others, (x, y, vx, vy) relative to it."""
+    obs = np.zeros((1, 3, 5), dtype=np.float32)
+    obs[0, 0] = 1, 1, y / 12, 1, vy / 20
     for row, other in enumerate(others, 1):
-        obs[0, row, 0] = 1
-        obs[0, row, 1:3] = np.array(other) / FAR
+        obs[0, row] = 1, *(np.array(other) / SCALES)
     return obs
 
 
-def test_passing_distance():
-    assert passing_distance(on_the_track()) == pytest.approx([np.inf])
-    assert FAR * passing_distance(on_the_track(0, (10, -3))) == pytest.approx([3.0])
-    # Turned by 30° to the right of the x-axis (y points down) the course passes 10 · sin 30° = 5 m away.
-    assert FAR * passing_distance(on_the_track(0, (10, 0), heading=math.pi / 6)) == pytest.approx([5.0], rel=1e-5)
-    # The nearer of two counts; those too far ahead or behind do not.
-    assert FAR * passing_distance(on_the_track(0, (10, 4), (-5, 2))) == pytest.approx([2.0])
-    assert passing_distance(on_the_track(0, (16, 0), (-7, 0))) == pytest.approx([np.inf])
+@pytest.mark.parametrize(
+    ("others", "miss"),
+    [
+        ([], np.inf),
+        ([(20, 1, -10, 0)], 1.0),  # beside it in 2 s
+        ([(20, 1, -10, 2)], 4.0),  # 1.5 to 2.5 s away, 4 m aside at the first of them
+        ([(50, 0, -10, 0)], np.inf),  # 4 s away
+        ([(20, 0, 10, 0)], np.inf),  # it drives away
+        ([(-4, 4, 0, -1)], 1.0),  # alongside, and nearer in 3 s
+        ([(20, 4, -10, 0), (22, -3, -10, 0)], 3.0),
+    ],
+)
+def test_passing_distance(others, miss):
+    assert passing_distance(on_the_road(4, 0, *others)) == pytest.approx([miss], rel=1e-5)
 
 
-def test_racetrack():
-    hit, graze, clear, far = (on_the_track(0, place) for place in ((10, 0), (10, 2), (10, 4.9), (16, 0)))
-    assert tasks.racetrack(graze, None, hit).tolist() == [False]
-    assert tasks.racetrack(hit, None, graze).tolist() == [True]
-    assert tasks.racetrack(clear, None, graze).tolist() == [False]
-    assert tasks.racetrack(far, None, hit).tolist() == [True]  # it only came into sight
-    # With nobody in the way it is lane keeping; else the lane does not matter.
-    assert tasks.racetrack(on_the_track(0.5), None, on_the_track(1.0)).tolist() == [False]
-    assert tasks.racetrack(on_the_track(1.0), None, on_the_track(0.5)).tolist() == [True]
-    assert tasks.racetrack(on_the_track(0.0), None, on_the_track(0.2)).tolist() == [True]
-    graze[0, 0, 7] = 0.9
-    assert tasks.racetrack(hit, None, graze).tolist() == [True]
+def test_highway():
+    hit, graze, clear = (on_the_road(4, 0, (20, side, -10, 0)) for side in (0, 2, 4))
+    assert tasks.highway(graze, None, hit).tolist() == [False]
+    assert tasks.highway(hit, None, graze).tolist() == [True]
+    assert tasks.highway(clear, None, graze).tolist() == [False]
+    assert tasks.highway(on_the_road(4, 0), None, hit).tolist() == [True]  # it only came into sight
+    # 10 m is the right edge, -2 m the left one; y grows to the right.
+    right, left, middle = (lambda vy, y=y: on_the_road(y, vy) for y in (9, -1, 4))
+    assert tasks.highway(right(1.0), None, right(1.5)).tolist() == [False]
+    assert tasks.highway(right(2.0), None, right(1.5)).tolist() == [True]
+    assert tasks.highway(left(-1.0), None, left(-1.5)).tolist() == [False]
+    assert tasks.highway(left(-2.0), None, left(-1.5)).tolist() == [True]
+    assert tasks.highway(left(1.0), None, left(1.5)).tolist() == [True]
+    assert tasks.highway(middle(1.0), None, middle(1.5)).tolist() == [True]
+    assert tasks.highway(right(-1.0), None, right(1.5)).tolist() == [False]
 
 
 # ------------------------------------------------------------------ as they are used

@@ -352,8 +352,8 @@ def test_help_tells_ours_and_theirs(capsys):
 
 @pytest.mark.slow
 def test_the_options_of_an_entry_hold_for_evaluations_and_films():
-    # Without them racetrack-v0 has other observations. The share for validation is one that few examples cannot have.
-    which = ["--algo", "sac_ap", "--env", "racetrack-v0"]
+    # Without them it has other observations. The share for validation is one that few examples cannot have.
+    which = ["--algo", "sac_ap", "--env", "highway-fast-v0"]
     command = ["train", *which, "-n", "60", "--eval-freq", "40", "--eval-episodes", "1"]
     assert main([*command, "-params", "validation_fraction:0.05", "learning_starts:60"]) == 0
     assert main(["enjoy", *which, "--folder=logs", "--no-render", "-n", "20"]) == 0

@@ -4,17 +4,17 @@ Any of them is given to a guided algorithm by its name, ``ap_function="sb3_sap.t
 use what the environments return by default, unless their docstring names an option.
 """
 
-from sb3_sap.tasks.driving import parking, racetrack
+from sb3_sap.tasks.driving import highway, parking
 from sb3_sap.tasks.energy import acrobot, mountain_car, mountain_car_continuous
 from sb3_sap.tasks.pendulum import pendulum_energy, pendulum_height, pendulum_torque
 
 __all__ = [
     "acrobot",
+    "highway",
     "mountain_car",
     "mountain_car_continuous",
     "parking",
     "pendulum_energy",
     "pendulum_height",
     "pendulum_torque",
-    "racetrack",
 ]

@@ -1,4 +1,4 @@
-"""highway-env's tasks with a steering wheel: a parking lot, and a racetrack with another car on it."""
+"""highway-env's tasks with a steering wheel: a parking lot, and a highway with other cars on it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ GOAL_RADIUS = 0.1
 BRAKING = 4.0
 """m/s², a little less than the car can brake with."""
 
-FAR = 20.0
-"""m that one unit of the racetrack's observation is."""
-NEAR_AHEAD, NEAR_BEHIND = 15.0 / FAR, 6.0 / FAR
-"""From where to where another car is in the way; a car is 5 m long."""
-CLEARANCE = 4.5 / FAR
-"""Less than this to the side is in the same lane: lanes are 5 m wide, a car 2 m."""
-LANE_TOLERANCE = 0.1
-"""Share of half a lane within which a car may be anywhere."""
+SCALES = np.array([100.0, 12.0, 20.0, 20.0], dtype=np.float32)
+"""m, m, m/s and m/s that one unit of x, y, vx and vy is in the highway's observation."""
+CAR_LENGTH, CLEARANCE = 6.0, 3.0
+"""m between the middles of two cars, along and to the side, below which they may touch: a car is 5 by 2 m."""
+AHEAD = np.linspace(0, 3, 13, dtype=np.float32)
+"""s ahead at which it is looked where everybody will be."""
+LEFT_EDGE, RIGHT_EDGE = -2.0, 10.0
+"""m, where the road of three lanes ends."""
+EDGE_TIME = 1.0
+"""s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
 
 
 def parking(obs: Mapping[str, Array], actions: Array, next_obs: Mapping[str, Array]) -> BoolArray:
@@ -60,37 +62,36 @@ def _to_goal(obs: Mapping[str, Array]) -> FloatArray:
     return difference
 
 
-def racetrack(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
-    """``racetrack-v0``: False where another car is in the way, and the step turned towards it; or none is, and the step
-    took the car away from the middle of its lane.
+def highway(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
+    """``highway-fast-v0`` with a steering wheel: False where the car is going to hit another, and the step brought them
+    still nearer; or where it is about to leave the road, and the step made it faster towards the edge.
 
-    *Heuristic.* In the way is who would be passed at less than `CLEARANCE` if one's own course were straight and the
-    other stood still; to turn so that this is still less brings the crash nearer. But where the other lane is taken, or
-    the road ends, turning away is no better. The other half is the paper's lane keeping.
+    *Heuristic.* On straight courses at their present speeds two cars pass at some lateral distance, or hit: to bring
+    them nearer to each other brings nothing but the crash. But the other way may be closed by a third.
 
-    :param obs: (n, cars, 9) of highway-env's Kinematics, ranges as in ``zoo_configs``: presence, x, y, vx, vy, cos_h,
-        sin_h, lat_off, ang_off; the other cars relative to the first
+    :param obs: (n, cars, 5) of highway-env's Kinematics, features and ranges as in ``zoo_configs``: presence, x, y, vx,
+        vy; the other cars relative to the first, whose y counts from the leftmost lane
     :param actions: (n, 1) steering
-    :param next_obs: (n, cars, 9)
+    :param next_obs: (n, cars, 5)
     :return: (n,) bool
     """
     del actions
-    clearance, next_clearance = passing_distance(obs), passing_distance(next_obs)
-    in_the_way = np.isfinite(clearance) & (next_clearance < CLEARANCE)
-    off, next_off = np.abs(obs[:, 0, 7]), np.abs(next_obs[:, 0, 7])
-    leaves_lane = (next_off > off) & (next_off > LANE_TOLERANCE)
-    mistake: BoolArray = np.where(in_the_way, next_clearance < clearance, leaves_lane)
+    miss, next_miss = passing_distance(obs), passing_distance(next_obs)
+    next_y, next_speed = next_obs[:, 0, 2] * SCALES[1], next_obs[:, 0, 4] * SCALES[3]
+    room = np.where(next_speed > 0, RIGHT_EDGE - next_y, next_y - LEFT_EDGE)
+    faster_outward = np.abs(next_speed) > obs[:, 0, 4] * SCALES[3] * np.sign(next_speed)
+    runs_off = (room < np.abs(next_speed) * EDGE_TIME) & faster_outward
+    mistake: BoolArray = runs_off | ((next_miss < CLEARANCE) & (next_miss < miss) & np.isfinite(miss))
     return ~mistake
 
 
 def passing_distance(obs: Array) -> FloatArray:
-    """At what distance to the side a straight course passes the nearest such car, in units of `FAR`; (n,).
+    """m to the side by which the nearest car will be passed on straight courses, within `AHEAD`; (n,).
 
-    Infinite where no car is between `NEAR_BEHIND` and `NEAR_AHEAD`.
+    Infinite where nobody is passed.
     """
-    position, course = obs[:, 1:, 1:3], obs[:, :1, 5:7]  # (n, cars - 1, 2), (n, 1, 2)
-    ahead = (position * course).sum(axis=-1)
-    aside = np.abs(position[..., 0] * course[..., 1] - position[..., 1] * course[..., 0])
-    near = (obs[:, 1:, 0] > 0) & (ahead > -NEAR_BEHIND) & (ahead < NEAR_AHEAD)
-    nearest: FloatArray = np.where(near, aside, np.inf).min(axis=1)
+    x, y, vx, vy = np.moveaxis((obs[:, 1:, 1:5] * SCALES)[..., None], -2, 0)  # each (n, cars - 1, 1)
+    beside = np.abs(x + vx * AHEAD) < CAR_LENGTH  # (n, cars - 1, times)
+    present = obs[:, 1:, :1] > 0
+    nearest: FloatArray = np.where(present & beside, np.abs(y + vy * AHEAD), np.inf).min(axis=(1, 2))
     return nearest

@@ -115,8 +115,12 @@ def _zoo_run(folder: Path) -> dict[str, Any]:
     words[:2] = ["python", "-m"] if words[1] == "-m" else [Path(words[1]).name]
     best = folder / "best_model.zip"
     model = best.name if best.is_file() else f"{found.parent.name}.zip"
-    return {"model": model, "algo": named.algo, "env": named.env, "command": shlex.join(words)} | {
-        "env_kwargs": _zoo_env_kwargs(found.parent)
+    return {
+        "model": model,
+        "algo": named.algo,
+        "env": named.env,
+        "env_kwargs": _zoo_env_kwargs(found.parent),
+        "command": shlex.join(words),
     }
 
 

@@ -44,7 +44,7 @@ def parking(obs: Mapping[str, Array], actions: Array, next_obs: Mapping[str, Arr
     """
     del actions
     distance, next_speed = np.linalg.norm(_to_goal(next_obs), axis=1), approach_speed(next_obs)
-    can_stop = (5 * next_speed) ** 2 < 2 * BRAKING * 100 * distance
+    can_stop = (5 * np.maximum(next_speed, 0)) ** 2 < 2 * BRAKING * 100 * distance
     mistake: BoolArray = (distance > GOAL_RADIUS) & (next_speed < approach_speed(obs)) & can_stop
     return ~mistake
 

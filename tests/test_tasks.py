@@ -139,7 +139,8 @@ def test_parking():
     assert tasks.parking(towards, None, aside).tolist() == [False]
     assert tasks.parking(away, None, still).tolist() == [True]
     assert tasks.parking(towards, None, towards).tolist() == [True]
-    assert tasks.parking(parked(0, 0, -4, 0), None, parked(0, 0, -5, 0)).tolist() == [False]
+    assert tasks.parking(parked(0, 0, -2, 0), None, parked(0, 0, -2.5, 0)).tolist() == [False]
+    assert tasks.parking(parked(0, 0, -4, 0), None, parked(0, 0, -5, 0)).tolist() == [True]  # too fast to stop
     # From 15 m/s no car stops within 20 m, from 10 m/s it does; within 10 m nothing is said.
     assert tasks.parking(parked(0.1, 0, 3.2, 0), None, parked(0.1, 0, 3, 0)).tolist() == [True]
     assert tasks.parking(parked(0.1, 0, 3.2, 0), None, parked(0.1, 0, 2, 0)).tolist() == [False]

@@ -11,6 +11,7 @@ import inspect
 import time
 from collections import defaultdict
 from statistics import median
+from typing import Any
 
 import gymnasium as gym
 import torch as th
@@ -37,9 +38,10 @@ def timed(name, function):
 
 
 def watch_the_parts() -> None:
-    PermissibilityCallback.fit = timed("fit E", PermissibilityCallback.fit)
-    PermissibilityCallback.validate = timed("validate E", PermissibilityCallback.validate)
-    guided = sb3_sap.exploration.ActionPermissibilityMixin
+    callback: Any = PermissibilityCallback
+    callback.fit = timed("fit E", callback.fit)
+    callback.validate = timed("validate E", callback.validate)
+    guided: Any = sb3_sap.exploration.ActionPermissibilityMixin
     guided._guide = timed("Algorithm 1", guided._guide)
     sb3_sap.exploration.permissible_actor_step = timed("teach the actor", sb3_sap.exploration.permissible_actor_step)
 

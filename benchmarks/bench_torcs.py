@@ -7,6 +7,7 @@ python benchmarks/bench_torcs.py [TRACK]
 
 import sys
 import time
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -31,7 +32,8 @@ def main(track: str = "wheel-2") -> None:
                 obs, _ = env.reset()
         rate = steps / (time.process_time() - begin)
         print(f"control step {control_step} s: {rate:,.0f} steps/s, {rate * control_step:,.0f}× real time")
-    simulation = env.unwrapped.simulator.simulation
+    unwrapped: Any = env.unwrapped
+    simulation = unwrapped.simulator.simulation
     begin = time.process_time()
     simulation.advance(TICKS)
     seconds = time.process_time() - begin

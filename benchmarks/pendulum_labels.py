@@ -16,7 +16,8 @@ from sb3_sap.benchmark.cells import make_cell
 from sb3_sap.benchmark.columns import parse_column
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
-from sb3_sap.benchmark.tasks import make_env, planned_steps
+from sb3_sap.benchmark.tasks import planned_steps
+from sb3_sap.evaluation import make_env
 
 TASK = "Pendulum-v1"
 NAMES = ("pendulum_height", "pendulum_torque", "pendulum_energy")
@@ -28,11 +29,11 @@ def main(seeds: int, out: Path) -> None:
     rows = []
     for seed in range(seeds):
         cell = make_cell(parse_column("sac:task"), TASK, planned_steps(TASK), seed)
-        model = make_model(cell.algo, make_env(TASK, cell.training), cell.settings, seed)
+        model = make_model(cell.algo, make_env(TASK, **cell.training), cell.settings, seed)
         model.learn(cell.steps)
         for name in NAMES:
             report = check_permissibility(
-                make_env(TASK, {}), f"sb3_sap.tasks.{name}", policy=model, seed=seed, verbose=False
+                make_env(TASK), f"sb3_sap.tasks.{name}", policy=model, seed=seed, verbose=False
             )
             found = {
                 "AP function": name,

@@ -1,8 +1,8 @@
 """Why DDPG-AP with the paper's settings may spin at the standing start: what E says there, and what follows.
 
 Trains with the paper's settings on TORCS' Wheel-2, with E as the paper trains it and with E as this package does by
-default, and looks after 500 steps at the first second of a lap from standstill, the actor steering: the *spread* of
-E's probability over five steering angles (how much the action matters to E) and the share of steps at which E would
+default, and looks after 500 steps at the first two seconds of a lap from standstill, the actor steering: the *spread*
+of E's probability over five steering angles (how much the action matters to E) and the share of steps at which E would
 let the actor's own action pass though it was a mistake. Seeds 0 to 9: it explains the runs that are reported.
 
 python benchmarks/standing_start.py [--seeds 10] [--out docs/results/standing_start.csv]
@@ -10,6 +10,7 @@ python benchmarks/standing_start.py [--seeds 10] [--out docs/results/standing_st
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,8 +21,7 @@ from sb3_sap.benchmark.cells import make_cell
 from sb3_sap.benchmark.columns import parse_column
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
-from sb3_sap.benchmark.tasks import make_env
-from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env
+from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env, make_env
 
 STEPS, TRACK = 500, "g-track-1"
 LOOK = 10  # control steps of 0.2 s, two seconds
@@ -36,7 +36,7 @@ COLUMNS = {
 def look(column: str, seed: int) -> dict[str, float]:
     """Trains one model and returns what E and the actor do at the standing start."""
     cell = make_cell(parse_column(column), "torcs", 3_000, seed)  # t_k is that of a run of 3,000 steps
-    model = make_model(cell.algo, make_env(ENVIRONMENTS["torcs"], cell.training), cell.settings, seed)
+    model: Any = make_model(cell.algo, make_env(ENVIRONMENTS["torcs"], **cell.training), cell.settings, seed)
     model.learn(STEPS)
     env = lap_env(TRACK, "torcs")
     obs, _ = env.reset(seed=0)

@@ -109,7 +109,7 @@ def main() -> None:
 
         study.optimize(objective, n_trials=options.trials)
         candidates = []
-        for trial in sorted(study.trials, key=lambda t: -t.value):
+        for trial in sorted(study.trials, key=lambda t: -(t.value or 0.0)):
             if trial.params not in candidates:
                 candidates.append(trial.params)
         again = {

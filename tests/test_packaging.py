@@ -1,0 +1,113 @@
+"""What is published: the wheel that is built from the sdist works with what it declares, and with nothing else."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+LEFT_OUT = shutil.ignore_patterns(".*", "*.egg-info", "__pycache__", "build", "dist", "results", "_build")
+#: What a user of each extra imports or runs.
+PROGRAMS = {
+    "": """
+        import gymnasium as gym
+        from sb3_sap.presets import algorithms, preset
+
+        env = gym.make("sap/LaneKeeping-v0", track="eroad")
+        sb3_sap.DDPGAP("MlpPolicy", env, **preset("fast")).learn(120, progress_bar=True)
+        assert all(isinstance(preset("default", algo), dict) for algo in algorithms())
+        assert main(["benchmark", "report"]) == 1  # a sentence says which extra is needed
+    """,
+    "benchmark": """
+        grid = ["--simulator", "highway", "--columns", "linear", "--tracks", "eroad", "--out", "."]
+        assert main(["benchmark", "summary", *grid]) == 0
+    """,
+    "dask": "import distributed, sb3_sap.benchmark.runner",
+    "docs": "import furo, myst_parser, sphinx.application",
+    "hub": "import huggingface_sb3, sb3_sap.hub",
+    "postgres": "import psycopg, sb3_sap.zoo.storages, sb3_sap.zoo.tuning",
+    "zoo": 'main(["train", "--algo", "ddpg_ap", "--env", "sap/LaneKeeping-v0", "-n", "50", "-f", "logs"])',
+}
+#: What each of them begins with: what is not declared cannot be found, as if it were not installed.
+ALONE = """
+    import sys
+
+    class Without:
+        def __init__(self, finder):
+            self.finder = finder
+
+        def __getattr__(self, name):
+            return getattr(self.finder, name)
+
+        def find_spec(self, name, *rest):
+            return None if name.partition(".")[0] in {absent} else self.finder.find_spec(name, *rest)
+
+    sys.meta_path[:] = map(Without, sys.meta_path)
+    import sb3_sap
+    from sb3_sap.cli import main
+    assert sb3_sap.__file__.startswith({site!r}), sb3_sap.__file__
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder into which the wheel, and nothing else, is installed."""
+    folder = tmp_path_factory.mktemp("published")
+    shutil.copytree(ROOT, folder / "source", ignore=LEFT_OUT)
+    run("-m", "build", "--outdir", folder, folder / "source")  # the sdist, and from it the wheel
+    [wheel] = folder.glob("*.whl")
+    run("-m", "pip", "install", "-q", "--no-deps", "--target", folder / "site", wheel)
+    return folder / "site"
+
+
+def run(*arguments, **options):
+    done = subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, **options)
+    assert done.returncode == 0, done.stderr
+
+
+def normal(name):
+    return re.sub("[-_.]+", "-", name).lower()
+
+
+def brought_by(distribution, extra):
+    """The names of all that is installed with a distribution and one of its extras."""
+    found, wanted = set(), [(distribution, extra)]
+    while wanted:
+        distribution, extra = wanted.pop()
+        if (name := normal(distribution.name)) and (name, extra) not in found:
+            found.add((name, extra))
+            for needed in map(Requirement, distribution.requires or []):
+                if needed.marker is None or needed.marker.evaluate({"extra": extra}):
+                    [installed] = metadata.distributions(name=needed.name)
+                    wanted += [(installed, one) for one in needed.extras or {""}]
+    return {name for name, _ in found}
+
+
+def test_every_file_of_the_package_is_in_the_wheel(site):
+    [wheel] = site.parent.glob("*.whl")
+    folders = ROOT / "sb3_sap", ROOT / "sb3_sap" / "zoo_configs"  # the latter is a link, which rglob does not follow
+    files = {path for folder in folders for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"}
+    wanted = {path.relative_to(ROOT).as_posix() for path in files}
+    assert {"sb3_sap/zoo_configs/ddpg_ap.yml", "sb3_sap/py.typed"} <= wanted
+    assert wanted <= set(zipfile.ZipFile(wheel).namelist())
+
+
+@pytest.mark.parametrize("extra", PROGRAMS)
+def test_it_works_with_each_extra_alone(site, extra, tmp_path):
+    [published] = metadata.distributions(name="sb3-sap", path=[str(site)])
+    declared = brought_by(published, extra)
+    owners = metadata.packages_distributions()
+    absent = {module for module, names in owners.items() if not declared & set(map(normal, names))}
+    assert {"mypy", "pytest"} <= absent
+    program = textwrap.dedent(ALONE).format(absent=absent, site=str(site)) + textwrap.dedent(PROGRAMS[extra])
+    run("-c", program, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)})

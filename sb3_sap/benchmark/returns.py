@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_sap.benchmark.figures import line_figure
-from sb3_sap.benchmark.measures import median_reached
+from sb3_sap.benchmark.measures import median_reached, ms_per_step
 from sb3_sap.benchmark.pages import markdown, write_csv, write_figure, write_page
 from sb3_sap.benchmark.results import Results
 from sb3_sap.evaluation import find_environment
@@ -22,7 +22,8 @@ NOTE = (
     "A run's return is the mean over its evaluation episodes, whose seeds are the same for every run, of the actor "
     "alone. Of the runs stands the interquartile mean with its 95 % bootstrap interval. *Permissible* is the share of "
     "the actor's actions in the last evaluation that the task's AP function does not call a mistake: what a policy "
-    "that has learned the task is refused by it shows how far it is from being sound.\n"
+    "that has learned the task is refused by it shows how far it is from being sound. A step's milliseconds are those "
+    "of the processor.\n"
 )
 
 
@@ -93,9 +94,8 @@ def _row(results: Results, runs: pd.DataFrame, name: str, threshold: float | Non
     if last["success"].notna().any():
         row["success"] = f"{last['success'].astype(float).mean():.0%}"
     curve = results.curve[results.curve["column"] == name]
-    time = results.times[results.times["column"] == name].groupby("seed").last()
+    milliseconds = ms_per_step(results.times[results.times["column"] == name]).median()
     accuracy = pd.to_numeric(curve["accuracy"]).mean()
-    milliseconds = (1000 * time["training_seconds"] / time["checkpoint"]).median()
     return row | {
         "permissible": f"{last['permissible'].mean():.1%}",
         "accuracy of E": "" if np.isnan(accuracy) else f"{accuracy:.3f}",

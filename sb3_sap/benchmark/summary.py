@@ -23,9 +23,10 @@ NOTE = (
     "Laps and S are those after the whole training, on the unseen tracks, the actor alone; S is the interquartile mean "
     "over seeds and tracks with its 95 % stratified bootstrap interval, the worst seed by its mean over the tracks. A "
     "run is *competent* at the first checkpoint at which every unseen lap is done with S at or above the threshold: "
-    "the median over seeds, a run that never is counted as infinite, and how many are. Wall-clock counts from the "
-    "start of the process, without evaluation. Episodes off the road are those of the training that end with the car "
-    "off the road or backwards: medians over seeds. Accuracy is E's, balanced, on validation examples.\n"
+    "the median over seeds, a run that never is counted as infinite, and how many are. Times are of the processor, "
+    "evaluation left out, and count from the start of the process: as a run has one thread, they are what one waits "
+    "where nothing else runs. Episodes off the road are those of the training that end with the car off the road or "
+    "backwards: medians over seeds. Accuracy is E's, balanced, on validation examples.\n"
 )
 
 
@@ -64,7 +65,7 @@ def _summary_row(runs: pd.DataFrame, laps: pd.DataFrame, name: str) -> dict[str,
         row[f"steps until S ≥ {threshold}"] = _reached(runs[f"steps_to_{threshold}"])
     lowest = runs["lowest_accuracy"].min()
     return row | {
-        "seconds until S ≥ 0.95": _reached(runs["wall_to_0.95"]),
+        "seconds until S ≥ 0.95": _reached(runs["seconds_to_0.95"]),
         "episodes off the road": _number(runs["off_track"].median()),
         "the last at step": _number(runs["last_off_track"].median()),
         "ms per step": _number(runs["ms_per_step"].median(), 1),

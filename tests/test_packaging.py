@@ -84,12 +84,13 @@ def brought_by(distribution, extra):
     found, wanted = set(), [(distribution, extra)]
     while wanted:
         distribution, extra = wanted.pop()
-        if (name := normal(distribution.name)) and (name, extra) not in found:
-            found.add((name, extra))
-            for needed in map(Requirement, distribution.requires or []):
-                if needed.marker is None or needed.marker.evaluate({"extra": extra}):
-                    [installed] = metadata.distributions(name=needed.name)
-                    wanted += [(installed, one) for one in needed.extras or {""}]
+        if (normal(distribution.name), extra) in found:
+            continue
+        found.add((normal(distribution.name), extra))
+        for needed in map(Requirement, distribution.requires or []):
+            if needed.marker is None or needed.marker.evaluate({"extra": extra}):
+                [installed] = metadata.distributions(name=needed.name)
+                wanted += [(installed, one) for one in needed.extras or {""}]
     return {name for name, _ in found}
 
 

@@ -39,8 +39,8 @@ def steps_to_competence(laps: pd.DataFrame, threshold: float) -> pd.Series:
 def seconds_to_competence(results: Results, threshold: float) -> pd.Series:
     """Seconds of processor from the start of the process until then, evaluation left out.
 
-    A run has one thread, so that they are what a user waits where nothing else runs; and on a busy machine, too, where
-    the wall-clock says more of the others.
+    A run has one thread, so that they are what a user waits where nothing else runs. The wall-clock of a busy machine
+    would tell of the others.
     """
     steps = steps_to_competence(results.laps, threshold).rename("checkpoint").reset_index()
     found = steps.merge(results.times.astype({"checkpoint": float}), on=["column", "seed", "checkpoint"], how="left")

@@ -24,9 +24,10 @@ NOTE = (
     "over seeds and tracks with its 95 % stratified bootstrap interval, the worst seed by its mean over the tracks. A "
     "run is *competent* at the first checkpoint at which every unseen lap is done with S at or above the threshold: "
     "the median over seeds, a run that never is counted as infinite, and how many are. Times are of the processor, "
-    "evaluation left out, and count from the start of the process: as a run has one thread, they are what one waits "
-    "where nothing else runs. Episodes off the road are those of the training that end with the car off the road or "
-    "backwards: medians over seeds. Accuracy is E's, balanced, on validation examples.\n"
+    "evaluation left out: as a run has one thread, they are what one waits where nothing else runs. Seconds count from "
+    "the start of the process, milliseconds from the first checkpoint on. Episodes off the road are those of the "
+    "training that end with the car off the road or backwards: medians over seeds. Accuracy is E's, balanced, on "
+    "validation examples.\n"
 )
 
 

@@ -10,11 +10,13 @@ from PIL import Image
 from sb3_sap.benchmark.cells import make_grid, write_result
 from sb3_sap.benchmark.claims import CLAIMS, claims, judged
 from sb3_sap.benchmark.columns import parse_columns
+from sb3_sap.benchmark.drawing import curve_figure
 from sb3_sap.benchmark.figures import with_averages
 from sb3_sap.benchmark.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.benchmark.results import collect
 from sb3_sap.benchmark.summary import improvement
+from sb3_sap.benchmark.tables import curve_table
 from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, LAP_COLUMNS, TIME_COLUMNS
 from sb3_sap.cli import main
 from sb3_sap.statistics import probability_of_improvement
@@ -175,6 +177,24 @@ def test_the_same_runs_give_the_same_bytes(tmp_path):
         assert report(tmp_path, "--steps", "500") == 0
         found.append({path.name: path.read_bytes() for path in (tmp_path / "highway-500").iterdir() if path.is_file()})
     assert found[0] == found[1]
+
+
+def test_the_curve_shows_each_column_beside_what_it_is_compared_with(tmp_path):
+    results = make(tmp_path, ["ddpg:paper", "ddpg_ap:paper", "ddpg_ap:fast", "td3:tuned", "ddpg:default", "linear"])
+    axes = curve_figure(curve_table(results), results.columns).axes
+    panels = [[text.get_text() for text in left.get_legend().get_texts()] for left in axes[::2]]
+    assert panels == [
+        ["ddpg:paper", "ddpg_ap:paper", "linear"],
+        ["ddpg_ap:fast", "ddpg:default", "linear"],
+        ["td3:tuned", "linear"],
+    ]
+
+
+def test_what_does_not_learn_has_no_curve(tmp_path, capsys):
+    make(tmp_path, ["linear"])
+    assert report(tmp_path) == 0
+    assert "curve is left out: none of these columns learns" in capsys.readouterr().out
+    assert (tmp_path / "highway-3000" / "headline.md").is_file()
 
 
 def test_nothing_to_report(tmp_path, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from sb3_sap.benchmark.figures import line_figure
+from sb3_sap.benchmark.drawing import line_figure
 from sb3_sap.benchmark.measures import median_reached, ms_per_step
 from sb3_sap.benchmark.pages import markdown, write_csv, write_figure, write_page
 from sb3_sap.benchmark.results import Results

@@ -121,6 +121,14 @@ def test_guided_columns_are_compared_with_their_base_and_the_best_peer(tmp_path)
     }
 
 
+def test_a_harder_condition_is_compared_within_itself(tmp_path):
+    harder = ["ddpg_ap:fast[env.speed=80]", "ddpg:tuned[env.speed=80]"]
+    make(tmp_path, [*harder, "ddpg:tuned", "sac:tuned[env.random_start=true]"])
+    assert report(tmp_path, "--columns", *harder, "ddpg:tuned", name="harder") == 0
+    table = pd.read_csv(tmp_path / "highway-3000" / "harder_improvement.csv")
+    assert table[["guided", "against"]].to_numpy().tolist() == [[harder[0], f"{harder[1]} (best peer)"]]
+
+
 def test_the_headline_is_a_table_of_s_and_laps(tmp_path):
     make(tmp_path, ["ddpg_ap:paper", "ddpg:paper", "linear"])
     assert report(tmp_path, "--columns", "ddpg_ap:paper", "ddpg:paper", "linear", name="headline") == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from sb3_sap.evaluation import ENVIRONMENTS
 if TYPE_CHECKING:
     from sb3_sap.benchmark.cells import Cell
     from sb3_sap.benchmark.columns import Column
+    from sb3_sap.benchmark.results import Results
 
 Command = Callable[[argparse.Namespace, Console], int]
 #: Each report, the columns that it shows unless told otherwise, and what it is.
@@ -28,6 +30,7 @@ REPORTS = {
     "summary": (["all"], "statistics of all columns, and how probably one beats another"),
     "headline": (["headline"], "the README's table: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "the same of DDPG-AP with one thing changed at a time"),
+    "harder": (["harder"], "the same at 80 km/h, and from random starts, with nothing tuned for it"),
 }
 #: Trainings of the paper, by their steps.
 PAPER_STEPS = (3_000, 15_000)
@@ -163,17 +166,16 @@ def _write(options: argparse.Namespace, name: str, console: Console, known_alone
 
     folder = _folder(options, options.steps)
     results = collect(_grid(options, options.steps, known_alone), folder / "cells", options.simulator, options.steps)
-    write = {
+    writers: dict[str, Callable[[Results, Path, str], None]] = {
         "table2": tables.table_2,
         "figure4": figures.figure_4,
         "figure5": figures.figure_5,
         "curve": figures.curve,
-        "summary": summary.summary,
         "headline": tables.headline,
-        "ablations": summary.ablations,
+        **{kind: partial(summary.summary, name=kind) for kind in ("summary", "ablations", "harder")},
         "returns": returns.returns,
-    }[name]
-    write(results, folder, command_line(options, name))
+    }
+    writers[name](results, folder, command_line(options, name))
     console.print(f"wrote {folder / name}.md", soft_wrap=True)
 
 

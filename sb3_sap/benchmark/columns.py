@@ -14,7 +14,7 @@ import yaml
 _COLUMN = re.compile(r"(?P<algo>\w+)(:(?P<preset>\w+))?(\[(?P<overrides>.+)\])?")
 
 PAPER = ["ddpg:paper", "ddpg_ce1:paper", "ddpg_ce2:paper", "ddpg_ap:paper", "ddpg_ap_ce2:paper"]
-_PEERS = ["ddpg", "td3", "sac", "tqc", "crossq"]
+PEERS = ["ddpg", "td3", "sac", "tqc", "crossq"]
 _GUIDED = ["ddpg_ap", "td3_ap", "sac_ap", "tqc_ap", "crossq_ap"]
 
 #: Names that stand for several columns.
@@ -22,7 +22,7 @@ GROUPS: dict[str, list[str]] = {
     # the five of Table 2, with the paper's settings
     "paper": PAPER,
     # what a user would pick today, as its library leaves it and tuned for this task
-    "peers": [f"{algo}:{preset}" for preset in ("default", "tuned") for algo in _PEERS],
+    "peers": [f"{algo}:{preset}" for preset in ("default", "tuned") for algo in PEERS],
     # guided, as the constructor leaves it and as fast as it gets
     "guided": ["ddpg_ap:default", *(f"{algo}:fast" for algo in _GUIDED)],
     # what the README shows
@@ -32,7 +32,7 @@ GROUPS: dict[str, list[str]] = {
         *("ddpg_ap:paper", "ddpg:paper", "linear"),
     ],
     # the peers in JAX, which people pick for wall-clock
-    "sbx": [f"sbx_{algo}:{preset}" for preset in ("default", "tuned") for algo in _PEERS],
+    "sbx": [f"sbx_{algo}:{preset}" for preset in ("default", "tuned") for algo in PEERS],
     # one thing changed at a time in DDPG-AP
     "ablations": [
         "ddpg_ap:default",
@@ -51,10 +51,13 @@ GROUPS: dict[str, list[str]] = {
     ],
     # faster, and from anywhere on the track, with nothing tuned for it
     "harder": [
-        f"{column}[{condition}]"
-        for condition in ("env.speed=80", "env.random_start=true")
-        for algo in ("ddpg", "sac", "tqc")
-        for column in (f"{algo}_ap:fast", f"{algo}:tuned")
+        *(
+            f"{column}[{condition}]"
+            for condition in ("env.speed=80", "env.random_start=true")
+            for algo in ("ddpg", "sac", "tqc")
+            for column in (f"{algo}_ap:fast", f"{algo}:tuned")
+        ),
+        "linear[env.speed=80]",
     ],
 }
 #: Columns of controllers that learn nothing, and have no presets.

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sb3_sap.benchmark.columns import PEERS
+from sb3_sap.benchmark.learners import environment_of
 from sb3_sap.benchmark.measures import (
     THRESHOLDS,
     median_reached,
@@ -29,11 +31,6 @@ NOTE = (
     "training that end with the car off the road or backwards: medians over seeds. Accuracy is E's, balanced, on "
     "validation examples.\n"
 )
-
-
-def ablations(results: Results, folder: Path, command: str) -> None:
-    """The same of the ablations, in files of their own."""
-    summary(results, folder, command, "ablations")
 
 
 def summary(results: Results, folder: Path, command: str, name: str = "summary") -> None:
@@ -84,16 +81,17 @@ def _number(value: float, digits: int = 0) -> str:
 
 
 def improvement(results: Results) -> pd.DataFrame:
-    """Each guided column against those of its own base, and against the best peer."""
+    """Each guided column against those of its own base, and against the best peer, in the same environment."""
     laps = results.final_laps()
-    guided = [column for column in results.columns if "_ap" in column.algo]
-    peers = [column for column in results.columns if column.algo in ("ddpg", "td3", "sac", "tqc", "crossq")]
-    peers = [column for column in peers if column.preset in ("default", "tuned")]
-    best = max(peers, key=lambda peer: interquartile_mean(score_matrix(laps, peer.name)), default=None)
     rows = []
-    for ours in guided:
+    for ours in results.columns:
+        if "_ap" not in ours.algo:
+            continue
+        alike = [column for column in results.columns if environment_of(column) == environment_of(ours)]
+        peers = [c for c in alike if c.algo in PEERS and c.preset in ("default", "tuned")]
+        best = max(peers, key=lambda peer: interquartile_mean(score_matrix(laps, peer.name)), default=None)
         base = ours.algo.partition("_ap")[0]
-        others = [column for column in results.columns if column.algo == base]
+        others = [column for column in alike if column.algo == base]
         if ours.preset == "paper":
             others = [column for column in others if column.preset == "paper"] or others
         for other in dict.fromkeys([*others, *([best] if best else [])]):

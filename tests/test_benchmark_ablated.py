@@ -1,10 +1,12 @@
 """The ablations differ from DDPG-AP in one thing each."""
 
+import gymnasium as gym
 import numpy as np
+import torch as th
 from test_exploration import StubPredictor, above
 from toy import GUIDED, Line, build
 
-from sb3_sap.benchmark.ablated import DDPGAPProposed, DDPGAPUnbalanced, UnbalancedFit
+from sb3_sap.benchmark.ablated import DDPGAPProposed, DDPGAPUnbalanced, KilometresPerHour, UnbalancedFit
 
 assert GUIDED  # build() gives small settings to those that it knows; here they are given by hand
 SMALL = {"dataset_size": 16, "validation_size": 8, "min_per_class": 2, "alpha": 1.0, "alpha_low": 1.0}
@@ -33,3 +35,9 @@ def test_unbalanced_fits(monkeypatch):
     monkeypatch.setattr(UnbalancedFit, "fit", lambda self: fits.append(self.num_timesteps))
     build(DDPGAPUnbalanced, **SMALL).learn(60, callback=lambda *_: True)
     assert fits[-1] == 60
+
+
+def test_the_units_of_table_1():
+    extractor = KilometresPerHour(gym.make("sap/LaneKeeping-v0").observation_space)
+    seen = extractor(th.tensor([[0.1, -0.5, 1.0, 0.02, 0.0]]))
+    np.testing.assert_allclose(seen, [[0.1, -0.5, 50.0, 1.0, 0.0]], rtol=1e-6)

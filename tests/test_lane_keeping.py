@@ -128,6 +128,13 @@ def test_leaving_the_road_or_facing_backwards_ends_the_episode(state: CarState, 
     assert (reward, terminated, truncated, info["off_track"]) == (-200.0, True, False, off_track)
 
 
+def test_what_losing_the_road_costs_can_be_chosen() -> None:
+    assert drive(started(car(track_pos=1.1), off_track_reward=-7.5))[1] == -7.5
+    assert drive(started(car(track_pos=0.5), off_track_reward=-7.5))[1] == 25.0
+    with pytest.raises(ValueError, match="off_track_reward must be a number, got inf"):
+        LaneKeepingEnv(ScriptedSimulator(), off_track_reward=math.inf)
+
+
 def test_the_edge_itself_is_on_the_road() -> None:
     _, reward, terminated, _, info = drive(started(car(track_pos=1.0)))
     assert (reward, terminated, info["off_track"]) == (pytest.approx(0.0), False, False)

@@ -1,16 +1,33 @@
-"""DDPG-AP with one of its parts taken out or turned round, for the benchmark's ablations alone."""
+"""Parts taken out or turned round, for what the benchmark asks alone."""
 
 from __future__ import annotations
 
 from typing import Any, cast
 
 import numpy as np
+import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.algorithms import DDPGAP
 from sb3_sap.callbacks import PermissibilityCallback
+from sb3_sap.envs.lane_keeping import OBSERVATION_SCALE
+
+
+class KilometresPerHour(FlattenExtractor):
+    """Lane keeping's observation in the units of Table 1: speeds of 50 beside an angle of hundredths."""
+
+    scale: th.Tensor
+
+    def __init__(self, observation_space: spaces.Box):
+        super().__init__(observation_space)
+        self.register_buffer("scale", th.as_tensor(OBSERVATION_SCALE, dtype=th.float32))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations * self.scale)
 
 
 class UnbalancedFit(PermissibilityCallback):

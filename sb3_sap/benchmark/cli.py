@@ -30,6 +30,7 @@ REPORTS = {
     "summary": (["all"], "statistics of all columns, and how probably one beats another"),
     "headline": (["headline"], "the README's table: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "the same of DDPG-AP with one thing changed at a time"),
+    "readings": (["readings"], "the same of the paper's DDPG, where the paper can be read otherwise"),
     "harder": (["harder"], "the same at 80 km/h, and from random starts, with nothing tuned for it"),
 }
 #: Trainings of the paper, by their steps.
@@ -73,7 +74,7 @@ def _add_columns(command: argparse.ArgumentParser, columns: list[str]) -> None:
         default=columns,
         metavar="COLUMN",
         help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, headline, sbx, "
-        "ablations, harder, all; of a task the presets are task, tuned and default",
+        "ablations, readings, harder, all; of a task the presets are task, tuned and default",
     )
 
 
@@ -172,7 +173,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, known_alone
         "figure5": figures.figure_5,
         "curve": figures.curve,
         "headline": tables.headline,
-        **{kind: partial(summary.summary, name=kind) for kind in ("summary", "ablations", "harder")},
+        **{kind: partial(summary.summary, name=kind) for kind in ("summary", "ablations", "readings", "harder")},
         "returns": returns.returns,
     }
     writers[name](results, folder, command_line(options, name))

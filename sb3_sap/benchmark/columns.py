@@ -49,6 +49,17 @@ GROUPS: dict[str, list[str]] = {
         "ddpg_ap_unbalanced:default",
         "ddpg_ap_proposed:default",
     ],
+    # what the paper leaves open, read otherwise in its DDPG, one thing at a time: why does ours drive after 3,000 steps?
+    "readings": [
+        "ddpg:paper",
+        *(f"ddpg:paper[env.off_track_reward={reward}]" for reward in (0, -20)),
+        *(f"ddpg:paper[env.{start}]" for start in ("random_start=true", "start=race")),
+        *(f"ddpg:paper[env.control_step={seconds}]" for seconds in (0.1, 0.4)),
+        "ddpg:paper[action_noise=null]",
+        "ddpg:paper[action_noise={type: ornstein-uhlenbeck, theta: 0.15, sigma: 0.2, dt: 0.01}]",
+        "ddpg:paper[train_freq=4]",
+        "ddpg:paper[policy_kwargs.features_extractor_class=sb3_sap.benchmark.ablated.KilometresPerHour]",
+    ],
     # faster, and from anywhere on the track, with nothing tuned for it
     "harder": [
         *(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -17,7 +18,6 @@ from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.rule import random_permissible
 from sb3_sap.benchmark.tasks import RETURN_COLUMNS, evaluation
-from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD
 from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env, make_env
 
 #: Steps between two points of a curve, and steps over which its reward is averaged (Fig. 4a).
@@ -98,7 +98,7 @@ class Recorder(BaseCallback):
         self._accuracies.append(getattr(self.model, "validation_accuracy", float("nan")))
         self._length, self._total = self._length + 1, self._total + reward
         if done:
-            self._end_episode(_how_ended(info, reward))
+            self._end_episode(_how_ended(info))
         if self.num_timesteps % INTERVAL == 0:
             self._point()
         return True
@@ -114,14 +114,14 @@ class Recorder(BaseCallback):
         self.curve.append([self.num_timesteps, round(sum(self._rewards) / len(self._rewards), 3), *accuracy])
 
 
-def _how_ended(info: dict[str, Any], reward: float) -> str:
+def _how_ended(info: dict[str, Any]) -> str:
     if info.get("TimeLimit.truncated"):
         return "truncated"
     if "off_track" not in info:
         return "terminated"
-    if reward != OFF_TRACK_REWARD:
-        return "still"
-    return "off track" if info["off_track"] else "backwards"
+    if info["off_track"]:
+        return "off track"
+    return "backwards" if math.cos(info["angle"]) < 0 else "still"
 
 
 def run_cell(cell: Cell, began: float) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import os
 from gymnasium.envs.registration import register
 
 from sb3_sap.envs.constraints import constraint_ce1, constraint_ce2
-from sb3_sap.envs.lane_keeping import CarState, LaneKeepingEnv, Simulator, ap_function, score
+from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD, CarState, LaneKeepingEnv, Simulator, ap_function, score
 from sb3_sap.envs.tracks import TRACKS, Track, get_track
 
 MAX_EPISODE_STEPS = 10_000
@@ -20,6 +20,7 @@ def make_lane_keeping(
     control_step: float = 0.2,
     laps: int | None = 1,
     random_start: bool = False,
+    off_track_reward: float = OFF_TRACK_REWARD,
     render_mode: str | None = None,
 ) -> LaneKeepingEnv:
     """Make `LaneKeepingEnv` on the embedded simulator: what ``gym.make("sap/LaneKeeping-v0", …)`` calls.
@@ -29,12 +30,15 @@ def make_lane_keeping(
     :param control_step: s between two actions
     :param laps: laps to drive, or None to drive on
     :param random_start: start anywhere on the track instead of at the line
+    :param off_track_reward: of the step that leaves the road or turns the car backwards
     :param render_mode: None, "rgb_array" or "human"
     """
     from sb3_sap.envs.highway import HighwaySimulator
 
     simulator = HighwaySimulator(track, speed, control_step)
-    return LaneKeepingEnv(simulator, laps=laps, random_start=random_start, render_mode=render_mode)
+    return LaneKeepingEnv(
+        simulator, laps=laps, random_start=random_start, off_track_reward=off_track_reward, render_mode=render_mode
+    )
 
 
 def make_torcs_lane_keeping(
@@ -45,6 +49,7 @@ def make_torcs_lane_keeping(
     start: str = "training",
     laps: int | None = 1,
     random_start: bool = False,
+    off_track_reward: float = OFF_TRACK_REWARD,
     render_mode: str | None = None,
 ) -> LaneKeepingEnv:
     """Make `LaneKeepingEnv` on TORCS: what ``gym.make("sap/TorcsLaneKeeping-v0", …)`` calls.
@@ -56,12 +61,15 @@ def make_torcs_lane_keeping(
     :param start: "training", 100 m before the line, or "race", the engine's own grid
     :param laps: laps to drive, or None to drive on
     :param random_start: start anywhere on the track
+    :param off_track_reward: of the step that leaves the road or turns the car backwards
     :param render_mode: None, "rgb_array" or "human"
     """
     from sb3_sap.envs.torcs.simulator import TorcsSimulator
 
     simulator = TorcsSimulator(track, speed, control_step, car, start)
-    return LaneKeepingEnv(simulator, laps=laps, random_start=random_start, render_mode=render_mode)
+    return LaneKeepingEnv(
+        simulator, laps=laps, random_start=random_start, off_track_reward=off_track_reward, render_mode=render_mode
+    )
 
 
 def make_torcs_driving(

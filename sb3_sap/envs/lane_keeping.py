@@ -126,8 +126,8 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
     Reward: Eq. (5) of the state reached.
 
     An episode *terminates* when the car leaves the road (|trackPos| > 1) or faces backwards (cos θ < 0), both with
-    `OFF_TRACK_REWARD` in place of Eq. (5), and when it stands still, with the reward unchanged. It is *truncated* when
-    the laps are completed, counted from where it started.
+    ``off_track_reward`` in place of Eq. (5), and when it stands still, with the reward unchanged. It is *truncated*
+    when the laps are completed, counted from where it started.
 
     ``info`` holds the raw angle (rad), track_pos, speed_x, speed_y, speed_z (km/h) and distance (m); off_track;
     ``covered``, the fraction driven of the laps (of one lap, beyond 1 too, if ``laps=None``); lap_done: they are
@@ -138,8 +138,9 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
     :param simulator: what moves the car
     :param laps: laps to drive, or None to drive on as the paper trains
     :param random_start: start anywhere on the track, somewhat off the axis, instead of at the line, centred, aligned
+    :param off_track_reward: of the step that loses the road; the paper gives no value
     :param render_mode: None, "rgb_array" or "human"
-    :raise ValueError: for laps or a render mode that cannot be, a start that does not exist, a steering of NaN
+    :raise ValueError: for an option that cannot be, a start that does not exist, a steering of NaN
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # type: ignore[misc]
@@ -150,15 +151,19 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         *,
         laps: int | None = 1,
         random_start: bool = False,
+        off_track_reward: float = OFF_TRACK_REWARD,
         render_mode: str | None = None,
     ) -> None:
         if laps is not None and (isinstance(laps, bool) or not isinstance(laps, (int, np.integer)) or laps < 1):
             raise ValueError(f"laps must be a positive whole number, or None to drive on, got {laps!r}.")
+        if not math.isfinite(off_track_reward):
+            raise ValueError(f"off_track_reward must be a number, got {off_track_reward!r}.")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode!r}.")
         self.simulator = simulator
         self.laps = laps
         self.random_start = random_start
+        self.off_track_reward = off_track_reward
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / simulator.control_step))}  # type: ignore[misc]
         limit = (OBSERVATION_LIMIT / OBSERVATION_SCALE).astype(np.float32)
@@ -211,7 +216,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         finished = self.laps is not None and info["lap_done"]
         if self.render_mode == "human":
             self.render()
-        earned = OFF_TRACK_REWARD if lost else self._reward(before, state)
+        earned = self.off_track_reward if lost else self._reward(before, state)
         return self._observation(), earned, lost or stands, finished, info
 
     def _drive(self, action: list[float]) -> CarState:

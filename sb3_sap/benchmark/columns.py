@@ -49,7 +49,7 @@ GROUPS: dict[str, list[str]] = {
         "ddpg_ap_unbalanced:default",
         "ddpg_ap_proposed:default",
     ],
-    # what the paper leaves open, read otherwise in its DDPG, one thing at a time: why does ours drive after 3,000 steps?
+    # what the paper leaves open, read otherwise in its DDPG, one thing at a time: why does ours drive so soon?
     "readings": [
         "ddpg:paper",
         *(f"ddpg:paper[env.off_track_reward={reward}]" for reward in (0, -20)),

@@ -11,7 +11,7 @@ import argparse
 import inspect
 import time
 from collections import defaultdict
-from statistics import median
+from statistics import mean
 from typing import Any
 
 import gymnasium as gym
@@ -94,7 +94,7 @@ def main() -> None:
                 begun = time.process_time()
                 model.learn(CHUNK, reset_num_timesteps=False)
                 times.append((time.process_time() - begun) / CHUNK * 1000)
-        plain, guided = map(median, spent)
+        plain, guided = map(mean, spent)
         shares = " | ".join(f"{1000 * seconds[part] / options.steps:.2f}" for part in parts)
         batches = (int(predictor.n_updates) - fitted) / options.steps
         products = 1000 * batches * products_of_a_batch(predictor)

@@ -30,7 +30,7 @@ REPORTS = {
     "summary": (["all"], "statistics of all columns, and how probably one beats another"),
     "headline": (["headline"], "the README's table: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "the same of DDPG-AP with one thing changed at a time"),
-    "readings": (["readings"], "the same of the paper's DDPG, where the paper can be read otherwise"),
+    "readings": (["readings"], "the same where the paper can be read otherwise"),
     "harder": (["harder"], "the same at 80 km/h, and from random starts, with nothing tuned for it"),
 }
 #: Trainings of the paper, by their steps.

@@ -49,7 +49,7 @@ GROUPS: dict[str, list[str]] = {
         "ddpg_ap_unbalanced:default",
         "ddpg_ap_proposed:default",
     ],
-    # what the paper leaves open, read otherwise in its DDPG, one thing at a time: why does ours drive so soon?
+    # what the paper leaves open, read otherwise, one thing at a time: why does our DDPG drive so soon?
     "readings": [
         "ddpg:paper",
         *(f"ddpg:paper[env.off_track_reward={reward}]" for reward in (0, -20)),
@@ -58,7 +58,10 @@ GROUPS: dict[str, list[str]] = {
         "ddpg:paper[action_noise=null]",
         "ddpg:paper[action_noise={type: ornstein-uhlenbeck, theta: 0.15, sigma: 0.2, dt: 0.01}]",
         "ddpg:paper[train_freq=4]",
-        "ddpg:paper[policy_kwargs.features_extractor_class=sb3_sap.benchmark.ablated.KilometresPerHour]",
+        *(
+            f"{column}[policy_kwargs.features_extractor_class=sb3_sap.benchmark.ablated.KilometresPerHour]"
+            for column in PAPER
+        ),
     ],
     # faster, and from anywhere on the track, with nothing tuned for it
     "harder": [

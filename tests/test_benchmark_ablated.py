@@ -2,11 +2,12 @@
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch as th
 from test_exploration import StubPredictor, above
 from toy import GUIDED, Line, build
 
-from sb3_sap.benchmark.ablated import DDPGAPProposed, DDPGAPUnbalanced, KilometresPerHour, UnbalancedFit
+from sb3_sap.benchmark.ablated import DDPGAPProposed, DDPGAPUnbalanced, KilometresPerHour, TorcsKeras, UnbalancedFit
 
 assert GUIDED  # build() gives small settings to those that it knows; here they are given by hand
 SMALL = {"dataset_size": 16, "validation_size": 8, "min_per_class": 2, "alpha": 1.0, "alpha_low": 1.0}
@@ -37,7 +38,10 @@ def test_unbalanced_fits(monkeypatch):
     assert fits[-1] == 60
 
 
-def test_the_units_of_table_1():
-    extractor = KilometresPerHour(gym.make("sap/LaneKeeping-v0").observation_space)
-    seen = extractor(th.tensor([[0.1, -0.5, 1.0, 0.02, 0.0]]))
-    np.testing.assert_allclose(seen, [[0.1, -0.5, 50.0, 1.0, 0.0]], rtol=1e-6)
+@pytest.mark.parametrize(
+    ("units", "expected"),
+    [(KilometresPerHour, [0.1, -0.5, 50.0, 1.0, 0.0]), (TorcsKeras, [0.1 / np.pi, -0.5, 50 / 300, 1 / 300, 0.0])],
+)
+def test_other_units_of_a_car_at_50_km_h(units, expected):
+    extractor = units(gym.make("sap/LaneKeeping-v0").observation_space)
+    np.testing.assert_allclose(extractor(th.tensor([[0.1, -0.5, 1.0, 0.02, 0.0]])), [expected], rtol=1e-6)

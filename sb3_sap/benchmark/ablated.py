@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
@@ -14,20 +15,33 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.algorithms import DDPGAP
 from sb3_sap.callbacks import PermissibilityCallback
-from sb3_sap.envs.lane_keeping import OBSERVATION_SCALE
 
 
-class KilometresPerHour(FlattenExtractor):
-    """Lane keeping's observation in the units of Table 1: speeds of 50 beside an angle of hundredths."""
+class OtherUnits(FlattenExtractor):
+    """Lane keeping's observation in other units, of which the paper names none."""
 
+    units: tuple[float, float, float, float, float]
+    """What angle, trackPos and the three speeds are multiplied by."""
     scale: th.Tensor
 
     def __init__(self, observation_space: spaces.Box):
         super().__init__(observation_space)
-        self.register_buffer("scale", th.as_tensor(OBSERVATION_SCALE, dtype=th.float32))
+        self.register_buffer("scale", th.tensor(self.units))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return super().forward(observations * self.scale)
+
+
+class KilometresPerHour(OtherUnits):
+    """As Table 1 lists them: speeds of 50 beside an angle of hundredths."""
+
+    units = (1.0, 1.0, 50.0, 50.0, 50.0)
+
+
+class TorcsKeras(OtherUnits):
+    """As in the code that the paper cites in its footnote 2: angles in π rad, speeds in 300 km/h."""
+
+    units = (1 / math.pi, 1.0, 1 / 6, 1 / 6, 1 / 6)
 
 
 class UnbalancedFit(PermissibilityCallback):

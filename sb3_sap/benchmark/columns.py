@@ -59,8 +59,9 @@ GROUPS: dict[str, list[str]] = {
         "ddpg:paper[action_noise={type: ornstein-uhlenbeck, theta: 0.15, sigma: 0.2, dt: 0.01}]",
         "ddpg:paper[train_freq=4]",
         *(
-            f"{column}[policy_kwargs.features_extractor_class=sb3_sap.benchmark.ablated.KilometresPerHour]"
-            for column in PAPER
+            f"{column}[policy_kwargs.features_extractor_class=sb3_sap.benchmark.ablated.{units}]"
+            for units, columns in (("TorcsKeras", ["ddpg:paper", "ddpg_ap:paper"]), ("KilometresPerHour", PAPER))
+            for column in columns
         ),
     ],
     # faster, and from anywhere on the track, with nothing tuned for it

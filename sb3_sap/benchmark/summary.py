@@ -18,7 +18,7 @@ from sb3_sap.benchmark.measures import (
     scores_with_interval,
 )
 from sb3_sap.benchmark.pages import markdown, write_csv, write_page
-from sb3_sap.benchmark.results import Results
+from sb3_sap.benchmark.results import NoResults, Results
 from sb3_sap.statistics import interquartile_mean, probability_of_improvement
 
 NOTE = (
@@ -35,6 +35,10 @@ NOTE = (
 
 def summary(results: Results, folder: Path, command: str, name: str = "summary") -> None:
     """Writes ``NAME.md``, ``NAME.csv`` with one row for every run, and ``NAME_improvement.csv`` of guided columns."""
+    if name != "summary" and len(results.columns) < 2:
+        raise NoResults(
+            f"of these columns there are results of {results.names[0]} alone, and nothing to compare it with."
+        )
     runs = per_run(results)
     write_csv(folder / f"{name}.csv", runs.reset_index().round(6))
     laps = results.final_laps()

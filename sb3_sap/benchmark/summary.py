@@ -98,6 +98,7 @@ def improvement(results: Results) -> pd.DataFrame:
         others = [column for column in alike if column.algo == base]
         if ours.preset == "paper":
             others = [column for column in others if column.preset == "paper"] or others
+        others = [column for column in others if column.overrides == ours.overrides] or others
         for other in dict.fromkeys([*others, *([best] if best else [])]):
             estimate = probability_of_improvement(score_matrix(laps, ours.name), score_matrix(laps, other.name))
             best_mark = " (best peer)" if other == best else ""

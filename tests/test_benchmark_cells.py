@@ -13,7 +13,7 @@ from sb3_sap.benchmark.cells import make_cell, make_grid, read_result, write_res
 from sb3_sap.benchmark.columns import GROUPS, Column, parse_column, parse_columns
 from sb3_sap.benchmark.learners import CLASSES, make_model, settings_of
 from sb3_sap.benchmark.linear import LinearFeedback
-from sb3_sap.benchmark.training import Recorder, run_cell
+from sb3_sap.benchmark.training import Recorder, how_ended, run_cell
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
 from sb3_sap.envs.torcs.installation import TorcsNotFoundError, find_installation
 
@@ -239,3 +239,17 @@ def test_every_class_exists():
         if not algo.startswith("sbx_"):
             env = "CartPole-v1" if "dqn" in algo else "sap/LaneKeeping-v0"
             assert make_model(algo, gym.make(env), {"buffer_size": 100}, 0).seed == 0
+
+
+@pytest.mark.parametrize(
+    ("info", "how"),
+    [
+        ({"off_track": True, "angle": 3.0}, "off track"),
+        ({"off_track": False, "angle": 3.0}, "backwards"),
+        ({"off_track": False, "angle": 0.3}, "still"),
+        ({"off_track": False, "angle": 0.3, "TimeLimit.truncated": True}, "truncated"),
+        ({}, "terminated"),
+    ],
+)
+def test_how_an_episode_ended(info, how):
+    assert how_ended(info) == how

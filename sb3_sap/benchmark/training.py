@@ -98,7 +98,7 @@ class Recorder(BaseCallback):
         self._accuracies.append(getattr(self.model, "validation_accuracy", float("nan")))
         self._length, self._total = self._length + 1, self._total + reward
         if done:
-            self._end_episode(_how_ended(info))
+            self._end_episode(how_ended(info))
         if self.num_timesteps % INTERVAL == 0:
             self._point()
         return True
@@ -114,7 +114,8 @@ class Recorder(BaseCallback):
         self.curve.append([self.num_timesteps, round(sum(self._rewards) / len(self._rewards), 3), *accuracy])
 
 
-def _how_ended(info: dict[str, Any]) -> str:
+def how_ended(info: dict[str, Any]) -> str:
+    """What ended an episode, from the info of its last step."""
     if info.get("TimeLimit.truncated"):
         return "truncated"
     if "off_track" not in info:

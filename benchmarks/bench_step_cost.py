@@ -11,7 +11,6 @@ import argparse
 import inspect
 import time
 from collections import defaultdict
-from statistics import mean
 from typing import Any
 
 import gymnasium as gym
@@ -73,6 +72,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--pairs", nargs="+", default=PAIRS)
     options = parser.parse_args()
+    if options.steps < CHUNK or options.steps % CHUNK:
+        parser.error(f"--steps must be a multiple of {CHUNK}, got {options.steps}.")
     th.set_num_threads(1)
     watch_the_parts()
     parts = ("fit E", "validate E", "teach the actor", "Algorithm 1")
@@ -88,13 +89,13 @@ def main() -> None:
         seconds.clear()
         predictor: Any = models[1].predictor
         fitted = int(predictor.n_updates)
-        spent: list[list[float]] = [[], []]
+        spent = [0.0, 0.0]
         for _ in range(options.steps // CHUNK):
-            for times, model in zip(spent, models, strict=True):
+            for number, model in enumerate(models):
                 begun = time.process_time()
                 model.learn(CHUNK, reset_num_timesteps=False)
-                times.append((time.process_time() - begun) / CHUNK * 1000)
-        plain, guided = map(mean, spent)
+                spent[number] += time.process_time() - begun
+        plain, guided = (1000 * each / options.steps for each in spent)
         shares = " | ".join(f"{1000 * seconds[part] / options.steps:.2f}" for part in parts)
         batches = (int(predictor.n_updates) - fitted) / options.steps
         products = 1000 * batches * products_of_a_batch(predictor)

@@ -1,28 +1,34 @@
 """What guidance costs for each training step: every guided algorithm beside its own base at equal settings.
 
 The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that whatever else
-the machine does meets both; processor time is counted. The parts are measured inside the guided model. Below the cost
-of fitting E lies that of its matrix products alone, which no other way of writing the same fit avoids.
+the machine does meets both; processor time is counted, over all of a run but its first 50 steps, which are random. The
+parts are measured inside the guided model. Below the cost of fitting E lies that of its matrix products alone, which no
+other way of writing the same fit avoids.
 
-Usage: python benchmarks/bench_step_cost.py [--steps 600] [--pairs ddpg:fast ddpg:paper …]
+python benchmarks/bench_step_cost.py [--steps 3000] [--pairs ddpg:fast ddpg:paper …]   # writes .csv and .md
 """
 
 import argparse
 import inspect
 import time
 from collections import defaultdict
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import pandas as pd
 import torch as th
 
 import sb3_sap.exploration
 from sb3_sap.benchmark.learners import algorithm_class, make_model
+from sb3_sap.benchmark.pages import markdown, write_csv, write_text
+from sb3_sap.benchmark.provenance import provenance
 from sb3_sap.callbacks import PermissibilityCallback
 from sb3_sap.presets import preset
 
 PAIRS = ("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast")
-CHUNK, WARM_UP = 50, 300
+CHUNK = 50
+PARTS = ("fit E", "validate E", "teach the actor", "Algorithm 1")
 seconds: defaultdict[str, float] = defaultdict(float)
 
 
@@ -67,39 +73,44 @@ def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
     return (time.process_time() - begun) / repeats
 
 
+def measure(pair: str, steps: int) -> dict[str, object]:
+    """One row: milliseconds a step of both models, and of the guided one's parts."""
+    base, name = pair.split(":")
+    settings = preset(name, f"{base}_ap", steps)
+    models = [build(algo, settings) for algo in (base, f"{base}_ap")]
+    spent = [0.0, 0.0]
+    seconds.clear()
+    for done in range(0, steps, CHUNK):
+        for number, model in enumerate(models):
+            begun = time.process_time()
+            model.learn(CHUNK, reset_num_timesteps=done == 0)
+            spent[number] += (time.process_time() - begun) * (done > 0)  # what comes first is warming up
+    predictor: Any = models[1].predictor
+    seconds["E's matrix products"] = int(predictor.n_updates) * products_of_a_batch(predictor)
+    plain, guided = (1000 * each / (steps - CHUNK) for each in spent)
+    row: dict[str, object] = {"pair": pair, "base, ms": f"{plain:.2f}", "guided, ms": f"{guided:.2f}"}
+    row["ratio"] = f"{guided / plain:.2f}"
+    return row | {f"{part}, ms": f"{1000 * seconds[part] / steps:.2f}" for part in (*PARTS, "E's matrix products")}
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=600)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--pairs", nargs="+", default=PAIRS)
+    parser.add_argument("--out", type=Path, default=Path("docs/results/step_cost.csv"))
     options = parser.parse_args()
-    if options.steps < CHUNK or options.steps % CHUNK:
-        parser.error(f"--steps must be a multiple of {CHUNK}, got {options.steps}.")
+    if options.steps < 2 * CHUNK or options.steps % CHUNK:
+        parser.error(f"--steps must be a multiple of {CHUNK}, from {2 * CHUNK} on, got {options.steps}.")
     th.set_num_threads(1)
     watch_the_parts()
-    parts = ("fit E", "validate E", "teach the actor", "Algorithm 1")
-    header = ["pair", "base, ms/step", "guided, ms/step", "ratio", *(f"{part}, ms" for part in parts)]
-    print(f"| {' | '.join(header)} | E's matrix products, ms |")
-    print("|" + "---|" * (5 + len(parts)))
+    rows = []
     for pair in options.pairs:
-        base, name = pair.split(":")
-        settings = preset(name, f"{base}_ap", 3_000)
-        models = [build(algo, settings) for algo in (base, f"{base}_ap")]
-        for model in models:
-            model.learn(WARM_UP)
-        seconds.clear()
-        predictor: Any = models[1].predictor
-        fitted = int(predictor.n_updates)
-        spent = [0.0, 0.0]
-        for _ in range(options.steps // CHUNK):
-            for number, model in enumerate(models):
-                begun = time.process_time()
-                model.learn(CHUNK, reset_num_timesteps=False)
-                spent[number] += time.process_time() - begun
-        plain, guided = (1000 * each / options.steps for each in spent)
-        shares = " | ".join(f"{1000 * seconds[part] / options.steps:.2f}" for part in parts)
-        batches = (int(predictor.n_updates) - fitted) / options.steps
-        products = 1000 * batches * products_of_a_batch(predictor)
-        print(f"| {pair} | {plain:.2f} | {guided:.2f} | {guided / plain:.2f} | {shares} | {products:.2f} |", flush=True)
+        rows.append(measure(pair, options.steps))
+        print(rows[-1], flush=True)
+        table, made = pd.DataFrame(rows), provenance()
+        write_csv(options.out, table)
+        of = f"{options.steps:,} steps, on {made['machine']}, {made['date']}, revision {made['revision']}."
+        write_text(options.out.with_suffix(".md"), f"{markdown(table)}\nProcessor time of a step over {of}\n")
 
 
 if __name__ == "__main__":

@@ -474,6 +474,17 @@ def test_damaged_surfaces(copy_of_torcs):
         Simulation("g-track-3", installation=copy_of_torcs)
 
 
+def test_a_simulation_that_outlives_its_module_ends_in_silence(torcs):
+    code = (
+        "import os\n"
+        "from sb3_sap.envs.torcs.simulation import Simulation\n"
+        "os.kept = Simulation('wheel-2')\n"  # JAX keeps environments alive like this
+        "os.kept.place(0.0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_track_without_a_road_leaves_no_trace(torcs, tmp_path):
     """TORCS builds this one without a segment; the copy of the library that did so must not be used again."""
     path = tmp_path / "empty.xml"

@@ -5,7 +5,9 @@ from __future__ import annotations
 import ctypes
 import math
 import os
+import sys
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -296,9 +298,10 @@ class Simulation:
             library.close_track()
             self._pool.release(library)
 
-    def __del__(self) -> None:
-        # Environments are often dropped without being closed; the libraries go back all the same.
-        if getattr(self, "_library", None) is not None:
+    def __del__(self, finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
+        # Environments are often dropped without being closed; the libraries go back all the same. As Python ends it
+        # empties its modules, this one too, and there is nobody left to give them back to.
+        if getattr(self, "_library", None) is not None and not finalizing():
             self.close()
 
     def _check_running(self) -> None:

@@ -22,6 +22,9 @@ from sb3_sap.prediction import guided_prediction
 from sb3_sap.predictor import candidate_logits, flush_denormals
 from sb3_sap.settings import SettingsMixin, check_at_least
 
+#: Of so many fits of E one is left once guidance has ended.
+FITS_AFTER_GUIDANCE = 5
+
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
     """Guides an SB3 off-policy algorithm with a learned AP predictor (Algorithm 1).
@@ -34,7 +37,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     :param t_k: steps with noise and without guidance, counted over the model's whole life. ``None``:
         ``learning_starts``, whose uniform random steps count inside it
     :param guidance_end: the step, counted as for ``t_k``, from which on the base algorithm acts and learns by itself
-        again; ``None``, the paper's: never. E goes on being fitted
+        again, and E is fitted a fifth as often; ``None``, the paper's: never
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
     :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
@@ -110,6 +113,10 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     def current_alpha(self) -> float:
         """α as E's validation accuracy allows it (section 4.3)."""
         return self.alpha if self.predictor_suffices else min(self.alpha_low, self.alpha)
+
+    def _fits_until(self, steps: int) -> int:
+        # Nothing asks E any more but `predict(guided=True)`: it need only keep up.
+        return super()._fits_until(steps) // (FITS_AFTER_GUIDANCE if self.guidance_ended else 1)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates

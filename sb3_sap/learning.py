@@ -191,18 +191,15 @@ class LearnedPermissibilityMixin(SettingsMixin):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def refits_due(self, before: int, now: int) -> int:
-        """How many fits belong to the steps after ``before``, up to ``now``.
+        """How many fits belong to the steps after ``before``, up to ``now``."""
+        return self._fits_until(now) - self._fits_until(before)
 
-        Their number grows with the steps at first, and with the logarithm once ``refit_growth`` of the steps is more
-        than one: what few new examples can change in E is soon little, but the cost of a fit stays.
-        """
-
-        def fits(steps: int) -> int:
-            if self.refit_growth * steps <= 1:
-                return steps
-            return int((1 + math.log(self.refit_growth * steps)) / self.refit_growth)
-
-        return fits(now) - fits(before)
+    def _fits_until(self, steps: int) -> int:
+        # As many as there are steps at first, then, once `refit_growth` of the steps is more than one, as their
+        # logarithm: what few new examples can change in E is soon little, but the cost of a fit stays.
+        if self.refit_growth * steps <= 1:
+            return steps
+        return int((1 + math.log(self.refit_growth * steps)) / self.refit_growth)
 
     @property
     def predictor_suffices(self) -> bool:

@@ -3,6 +3,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -80,6 +81,18 @@ def test_the_callback_asks_how_many_fits_are_due():
     late = [step for step in callback.fits if step > 100]
     assert len(late) == model.refits_due(50, 100) == 7  # 10·ln 2
     assert set(callback.validations) <= set(callback.fits)
+
+
+def test_after_guidance_every_fifth_fit_is_left_and_the_actor_does_not_notice(monkeypatch):
+    callback = Recorder()
+    build(DDPGAP, guidance_end=30, min_per_class=1).learn(60, callback=callback)
+    assert [step for step in callback.fits if step >= 30] == [30, 35, 40, 45, 50, 55, 60]
+
+    rarely = build(DDPGAP, guidance_end=30, min_per_class=1).learn(60)
+    monkeypatch.setattr("sb3_sap.exploration.FITS_AFTER_GUIDANCE", 1)
+    often = build(DDPGAP, guidance_end=30, min_per_class=1).learn(60)
+    assert rarely.predictor.n_updates < often.predictor.n_updates
+    assert all(map(th.equal, rarely.actor.parameters(), often.actor.parameters()))
 
 
 def test_fits_become_rarer_over_the_whole_life():

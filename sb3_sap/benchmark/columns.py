@@ -48,6 +48,8 @@ GROUPS: dict[str, list[str]] = {
         *(f"ddpg_ap:default[candidate_selection={name}]" for name in ("nearest", "highest_q", "most_permissible")),
         "ddpg_ap_unbalanced:default",
         "ddpg_ap_proposed:default",
+        "ddpg_ap:paper",
+        "ddpg_ap:paper[actor_permissibility_coef=1]",
     ],
     # what the paper leaves open, read otherwise, one thing at a time: why does our DDPG drive so soon?
     "readings": [

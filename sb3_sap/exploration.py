@@ -16,14 +16,12 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_sap.actor_loss import permissible_actor_step, permissible_value_step
 from sb3_sap.candidates import SELECTIONS, choose, q_values
 from sb3_sap.constraints import ConstrainedExplorationMixin, rows_of
+from sb3_sap.growth import check_growth, due
 from sb3_sap.learning import LearnedPermissibilityMixin
 from sb3_sap.permissibility import FloatArray
 from sb3_sap.prediction import guided_prediction
 from sb3_sap.predictor import candidate_logits, flush_denormals
 from sb3_sap.settings import SettingsMixin, check_at_least
-
-#: Of so many fits of E one is left once guidance has ended.
-FITS_AFTER_GUIDANCE = 5
 
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
@@ -36,13 +34,15 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     :param alpha_low: the same while E's balanced validation accuracy is below 70 % (the paper gives no value)
     :param t_k: steps with noise and without guidance, counted over the model's whole life. ``None``:
         ``learning_starts``, whose uniform random steps count inside it
-    :param guidance_end: the step, counted as for ``t_k``, from which on the base algorithm acts and learns by itself
-        again, and E is fitted a fifth as often; ``None``, the paper's: never
+    :param guidance_end: the step, counted as for ``t_k``, from which on the base algorithm acts by itself again;
+        ``None``, the paper's: never
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
     :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
         paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`, and for finite actions
         :func:`~sb3_sap.actor_loss.permissible_value_step`). It acts while E is good enough for ``alpha``
+    :param teaching_growth: as ``refit_growth``, of the actor loss and the updates of the base: 0, at each of them;
+        ``None``, as often as E is fitted
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.
@@ -61,6 +61,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         guidance_end: int | None = None,
         candidate_selection: str = "random",
         actor_permissibility_coef: float | Schedule | str = 0.0,
+        teaching_growth: float | None = None,
         **kwargs: Any,
     ):
         self.alpha = alpha
@@ -69,6 +70,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         self.guidance_end = guidance_end
         self.candidate_selection = candidate_selection
         self.actor_permissibility_coef: Any = actor_permissibility_coef
+        self.teaching_growth = teaching_growth
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -86,6 +88,8 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
                 f"{self.noise_steps} (`t_k`, or `learning_starts` where that is None).",
                 stacklevel=2,
             )
+        if self.teaching_growth is not None:
+            check_growth(self, "teaching_growth")
         if self.candidate_selection not in SELECTIONS:
             raise ValueError(
                 f"`candidate_selection` must be one of {', '.join(map(repr, SELECTIONS))}, but is "
@@ -106,7 +110,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
 
     @property
     def guidance_ended(self) -> bool:
-        """Whether the base algorithm is by itself again."""
+        """Whether the base algorithm acts by itself again."""
         return self.guidance_end is not None and self.life_steps >= self.guidance_end
 
     @property
@@ -114,18 +118,15 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         """α as E's validation accuracy allows it (section 4.3)."""
         return self.alpha if self.predictor_suffices else min(self.alpha_low, self.alpha)
 
-    def _fits_until(self, steps: int) -> int:
-        # Nothing asks E any more but `predict(guided=True)`: it need only keep up.
-        return super()._fits_until(steps) // (FITS_AFTER_GUIDANCE if self.guidance_ended else 1)
-
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates
         super().train(gradient_steps, batch_size)
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
-        if coef == 0 or self.guidance_ended or not self.predictor_suffices:
+        if coef == 0 or not self.predictor_suffices:
             return
         step = permissible_value_step if self.discrete else permissible_actor_step
-        for _ in range(self.refits_due(before, self._n_updates)):
+        growth = self.refit_growth if self.teaching_growth is None else self.teaching_growth
+        for _ in range(due(growth, before, self._n_updates)):
             loss = step(
                 self if self.discrete else self.actor,
                 self.predictor,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from sb3_sap.buffers import UNKNOWN, KnowledgeMixin, guided_buffer_class, reache
 from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.features import with_extractor
 from sb3_sap.generators import make_rng
+from sb3_sap.growth import check_growth
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, resolve
 from sb3_sap.predictor import PermissibilityPredictor
@@ -40,8 +39,8 @@ class LearnedPermissibilityMixin(SettingsMixin):
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
     :param min_per_class: examples of each class that K must hold before E is fitted, and makes room for when it is full
-    :param refit_growth: E is fitted and validated, and teaches the actor where it does, each time that the steps taken
-        have grown by this share; 0, the paper's, at every step
+    :param refit_growth: E is fitted and validated each time that the steps taken have grown by this share, for what few
+        new examples can change in it is soon little, but the cost of a fit stays; 0, the paper's, at every step
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
     """
 
@@ -75,9 +74,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
 
     def _setup_model(self) -> None:
         check_at_least(self, knowledge_buffer_size=4, min_per_class=1, dataset_size=2, validation_size=2)
-        growth: Any = self.refit_growth
-        if not (isinstance(growth, Real) and 0 <= float(growth) < 1):
-            raise ValueError(f"`refit_growth` is a share from 0 to below 1, but is {growth!r}.")
+        check_growth(self, "refit_growth")
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
@@ -189,17 +186,6 @@ class LearnedPermissibilityMixin(SettingsMixin):
                 if last is not None and reaches_clip(self._vec_normalize_env, last):
                     info[UNKNOWN] = True
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-
-    def refits_due(self, before: int, now: int) -> int:
-        """How many fits belong to the steps after ``before``, up to ``now``."""
-        return self._fits_until(now) - self._fits_until(before)
-
-    def _fits_until(self, steps: int) -> int:
-        # As many as there are steps at first, then, once `refit_growth` of the steps is more than one, as their
-        # logarithm: what few new examples can change in E is soon little, but the cost of a fit stays.
-        if self.refit_growth * steps <= 1:
-            return steps
-        return int((1 + math.log(self.refit_growth * steps)) / self.refit_growth)
 
     @property
     def predictor_suffices(self) -> bool:

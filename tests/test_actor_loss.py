@@ -115,27 +115,36 @@ def test_it_waits_until_e_is_good_enough(monkeypatch):
     assert len(calls) == 3
 
 
-def test_it_acts_as_often_as_e_is_fitted(monkeypatch):
+@pytest.mark.parametrize(
+    ("growths", "numbers"),
+    [
+        ({"refit_growth": 0.25}, [1, 2, 2, 5]),  # to 3, 4, 5 and 9 updates: of these 3, 4, 6, 7 and 9 are due
+        ({"refit_growth": 0.25, "teaching_growth": 0.0}, [1, 2, 3, 7]),
+        ({"teaching_growth": 0.25}, [1, 2, 2, 5]),
+    ],
+)
+def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, growths, numbers):
     calls = []
     monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
-    model = build(DDPGAP, actor_permissibility_coef=1.0, refit_growth=0.25).learn(60)
+    model = build(DDPGAP, actor_permissibility_coef=1.0, **growths).learn(60)
     model.validation_accuracy, model._n_updates = 1.0, 2
     calls.clear()
-    numbers = []
-    for updates in (1, 1, 1, 4):  # to 3, 4, 5 and 9: of these 3, 4, 6, 7 and 9 are due
+    counted = []
+    for updates in (1, 1, 1, 4):
         model.train(updates, 8)
-        numbers.append(len(calls))
-    assert numbers == [1, 2, 2, 5]
+        counted.append(len(calls))
+    assert counted == numbers
 
 
-def test_it_ends_with_guidance(monkeypatch):
+def test_it_goes_on_after_guidance(monkeypatch):
     steps = []
     model = build(DDPGAP, actor_permissibility_coef=1.0, guidance_end=60)
     monkeypatch.setattr(
         "sb3_sap.exploration.permissible_actor_step", lambda *args: steps.append(model.num_timesteps) or 0.0
     )
     model.learn(100)
-    assert 50 < max(steps) < 60
+    assert model.guidance_ended
+    assert max(steps) == 100
 
 
 # ------------------------------------------------------------------ finite actions

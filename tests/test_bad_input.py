@@ -109,6 +109,7 @@ def test_a_wrapper_that_labels_with_numbers():
         ),
         ({"n_candidates": 0}, "^`n_candidates` must be a whole number of at least 1, but is 0"),
         ({"refit_growth": 1.0}, "^`refit_growth` is a share from 0 to below 1, but is 1.0"),
+        ({"teaching_growth": 1}, "^`teaching_growth` is a share from 0 to below 1, but is 1"),
         ({"refit_growth": -0.1}, "^`refit_growth` is a share from 0 to below 1, but is -0.1"),
         ({"min_per_class": 0}, "^`min_per_class` must be a whole number of at least 1, but is 0"),
         ({"dataset_size": 1}, "^`dataset_size` must be a whole number of at least 2, but is 1"),

@@ -9,7 +9,6 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 
 from sb3_sap.buffers import KnowledgeMixin
-from sb3_sap.growth import due
 from sb3_sap.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
 from sb3_sap.tensorboard import add_layout
 
@@ -56,14 +55,13 @@ class PermissibilityCallback(BaseCallback):
         new = np.subtract(knowledge.seen, self._seen)
         if new.any():
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
-        n_envs = self.model.n_envs
-        refits = due(self.model.refit_growth, self._start // n_envs, self.model.life_steps // n_envs)
+        due = self.model.refits_due(self._start // self.model.n_envs, self.model.life_steps // self.model.n_envs)
         if min(knowledge.counts("train")) >= self.model.min_per_class:
-            for _ in range(refits):
+            for _ in range(due):
                 self.fit()
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)
-        if refits > 0 and self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
+        if due > 0 and self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
             self.validate()
 
     def fit(self) -> None:

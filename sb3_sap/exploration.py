@@ -23,6 +23,9 @@ from sb3_sap.prediction import guided_prediction
 from sb3_sap.predictor import candidate_logits, flush_denormals
 from sb3_sap.settings import SettingsMixin, check_at_least
 
+#: Of so many fits of E one is left once nothing asks it any more.
+FITS_AFTER_GUIDANCE = 5
+
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
     """Guides an SB3 off-policy algorithm with a learned AP predictor (Algorithm 1).
@@ -35,14 +38,15 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     :param t_k: steps with noise and without guidance, counted over the model's whole life. ``None``:
         ``learning_starts``, whose uniform random steps count inside it
     :param guidance_end: the step, counted as for ``t_k``, from which on the base algorithm acts by itself again;
-        ``None``, the paper's: never
+        ``None``, the paper's: never. Unless ``teaching_growth`` says otherwise, it learns by itself, too, and E is
+        fitted a fifth as often
     :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
         "nearest" to the actor's action, the one of "highest_q", or the one that E finds "most_permissible"
     :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
         paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`, and for finite actions
         :func:`~sb3_sap.actor_loss.permissible_value_step`). It acts while E is good enough for ``alpha``
-    :param teaching_growth: as ``refit_growth``, of the actor loss and the updates of the base: 0, at each of them;
-        ``None``, as often as E is fitted
+    :param teaching_growth: as ``refit_growth``, of the actor loss and the updates of the base: 0, at each of them, and
+        on after ``guidance_end``. ``None``: as often as E is fitted, as long as there is guidance
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.
@@ -118,11 +122,19 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         """α as E's validation accuracy allows it (section 4.3)."""
         return self.alpha if self.predictor_suffices else min(self.alpha_low, self.alpha)
 
+    @property
+    def predictor_rests(self) -> bool:
+        """Whether nothing asks E any more but ``predict(guided=True)``, for which it need only keep up."""
+        return self.guidance_ended and self.teaching_growth is None
+
+    def refits_due(self, before: int, now: int) -> int:
+        return due(self.refit_growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.predictor_rests else 1)
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates
         super().train(gradient_steps, batch_size)
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
-        if coef == 0 or not self.predictor_suffices:
+        if coef == 0 or self.predictor_rests or not self.predictor_suffices:
             return
         step = permissible_value_step if self.discrete else permissible_actor_step
         growth = self.refit_growth if self.teaching_growth is None else self.teaching_growth

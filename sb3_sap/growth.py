@@ -7,16 +7,18 @@ from numbers import Real
 from typing import Any
 
 
-def due(growth: float, before: int, now: int) -> int:
+def due(growth: float, before: int, now: int, one_of: int = 1) -> int:
     """How often work is due after the count ``before``, up to ``now``.
 
     At every count at first, then, once a share of ``growth`` is more than one, as their logarithm.
 
     :param growth: the share, from 0 (at every count) to below 1
+    :param one_of: of so many times one is left
     """
 
     def until(count: int) -> int:
-        return count if growth * count <= 1 else int((1 + math.log(growth * count)) / growth)
+        times = count if growth * count <= 1 else int((1 + math.log(growth * count)) / growth)
+        return times // one_of
 
     return until(now) - until(before)
 

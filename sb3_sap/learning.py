@@ -17,7 +17,7 @@ from sb3_sap.buffers import UNKNOWN, KnowledgeMixin, guided_buffer_class, reache
 from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.features import with_extractor
 from sb3_sap.generators import make_rng
-from sb3_sap.growth import check_growth
+from sb3_sap.growth import check_growth, due
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, resolve
 from sb3_sap.predictor import PermissibilityPredictor
@@ -186,6 +186,10 @@ class LearnedPermissibilityMixin(SettingsMixin):
                 if last is not None and reaches_clip(self._vec_normalize_env, last):
                     info[UNKNOWN] = True
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def refits_due(self, before: int, now: int) -> int:
+        """How many fits belong to the steps after ``before``, up to ``now``."""
+        return due(self.refit_growth, before, now)
 
     @property
     def predictor_suffices(self) -> bool:

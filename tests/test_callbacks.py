@@ -3,13 +3,13 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import GUIDED, Line, build
 
 from sb3_sap import DDPGAP, PermissibilityCallback
-from sb3_sap.growth import due
 from sb3_sap.knowledge import LabelledActions
 
 
@@ -69,23 +69,43 @@ def test_fits_follow_the_steps_collected(settings, n_envs, expected):
     ],
 )
 def test_fits_become_rarer_as_steps_grow(growth, steps):
-    assert [now for now in range(1, 13) if due(growth, now - 1, now)] == steps
-    assert due(growth, 0, 12) == len(steps)
+    model = build(DDPGAP, refit_growth=growth)
+    assert [now for now in range(1, 13) if model.refits_due(now - 1, now)] == steps
+    assert model.refits_due(0, 12) == len(steps)
 
 
 def test_the_callback_asks_how_many_fits_are_due():
     callback = Recorder()
     env = DummyVecEnv([lambda: Line(horizon=5)] * 2)
-    build(DDPGAP, env, refit_growth=0.1, min_per_class=1).learn(200, callback=callback)
+    model = build(DDPGAP, env, refit_growth=0.1, min_per_class=1).learn(200, callback=callback)
     late = [step for step in callback.fits if step > 100]
-    assert len(late) == due(0.1, 50, 100) == 7  # 10·ln 2
+    assert len(late) == model.refits_due(50, 100) == 7  # 10·ln 2
     assert set(callback.validations) <= set(callback.fits)
+
+
+def test_after_guidance_every_fifth_fit_is_left_and_the_actor_does_not_notice(monkeypatch):
+    callback = Recorder()
+    build(DDPGAP, guidance_end=30, min_per_class=1).learn(60, callback=callback)
+    assert [step for step in callback.fits if step >= 30] == [30, 35, 40, 45, 50, 55, 60]
+
+    rarely = build(DDPGAP, guidance_end=30, min_per_class=1).learn(60)
+    monkeypatch.setattr("sb3_sap.exploration.FITS_AFTER_GUIDANCE", 1)
+    often = build(DDPGAP, guidance_end=30, min_per_class=1).learn(60)
+    assert rarely.predictor.n_updates < often.predictor.n_updates
+    assert all(map(th.equal, rarely.actor.parameters(), often.actor.parameters()))
+
+
+def test_after_guidance_e_is_fitted_as_before_where_it_goes_on_teaching():
+    callback = Recorder()
+    settings = {"actor_permissibility_coef": 1.0, "teaching_growth": 0.0}
+    build(DDPGAP, guidance_end=30, min_per_class=1, **settings).learn(60, callback=callback)
+    assert [step for step in callback.fits if step >= 30] == list(range(30, 61))
 
 
 def test_fits_become_rarer_over_the_whole_life():
     model, callback = build(DDPGAP, refit_growth=0.1, min_per_class=1), Recorder()
     model.learn(100).learn(100, callback=callback)
-    assert len(callback.fits) == due(0.1, 100, 200) == 6  # 10·ln 2 is 6.9
+    assert len(callback.fits) == model.refits_due(100, 200) == 6  # 10·ln 2 is 6.9
 
 
 def test_nothing_is_fitted_before_each_class_has_its_minimum():

@@ -5,7 +5,7 @@ the machine does meets both; processor time is counted, over all of a run but it
 parts are measured inside the guided model. Below the cost of fitting E lies that of its matrix products alone, which no
 other way of writing the same fit avoids.
 
-python benchmarks/bench_step_cost.py [--steps 3000] [--pairs ddpg:fast ddpg:paper …]   # writes .csv and .md
+python benchmarks/bench_step_cost.py [--pairs ddpg:fast 'td3:fast[teaching_growth=0]' …]   # writes .csv and .md
 """
 
 import argparse
@@ -20,13 +20,17 @@ import pandas as pd
 import torch as th
 
 import sb3_sap.exploration
+from sb3_sap.benchmark.columns import parse_column
 from sb3_sap.benchmark.learners import algorithm_class, make_model
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
 from sb3_sap.benchmark.provenance import provenance
 from sb3_sap.callbacks import PermissibilityCallback
 from sb3_sap.presets import preset
 
-PAIRS = ("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast")
+PAIRS = (
+    *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
+    *(f"{algo}:fast[teaching_growth=0]" for algo in ("ddpg", "td3", "sac", "tqc")),
+)
 CHUNK = 50
 PARTS = ("fit E", "validate E", "teach the actor", "Algorithm 1")
 seconds: defaultdict[str, float] = defaultdict(float)
@@ -75,9 +79,10 @@ def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
 
 def measure(pair: str, steps: int) -> dict[str, object]:
     """One row: milliseconds a step of both models, and of the guided one's parts."""
-    base, name = pair.split(":")
-    settings = preset(name, f"{base}_ap", steps)
-    models = [build(algo, settings) for algo in (base, f"{base}_ap")]
+    column = parse_column(pair)
+    base, guided = column.algo, f"{column.algo}_ap"
+    settings = preset(column.preset, guided, steps) | column.changes
+    models = [build(algo, settings) for algo in (base, guided)]
     spent = [0.0, 0.0]
     seconds.clear()
     for done in range(0, steps, CHUNK):
@@ -87,9 +92,9 @@ def measure(pair: str, steps: int) -> dict[str, object]:
             spent[number] += (time.process_time() - begun) * (done > 0)  # what comes first is warming up
     predictor: Any = models[1].predictor
     seconds["E's matrix products"] = int(predictor.n_updates) * products_of_a_batch(predictor)
-    plain, guided = (1000 * each / (steps - CHUNK) for each in spent)
-    row: dict[str, object] = {"pair": pair, "base, ms": f"{plain:.2f}", "guided, ms": f"{guided:.2f}"}
-    row["ratio"] = f"{guided / plain:.2f}"
+    alone, together = (1000 * each / (steps - CHUNK) for each in spent)
+    row: dict[str, object] = {"pair": pair, "base, ms": f"{alone:.2f}", "guided, ms": f"{together:.2f}"}
+    row["ratio"] = f"{together / alone:.2f}"
     return row | {f"{part}, ms": f"{1000 * seconds[part] / steps:.2f}" for part in (*PARTS, "E's matrix products")}
 
 

@@ -129,6 +129,16 @@ def test_a_harder_condition_is_compared_within_itself(tmp_path):
     assert table[["guided", "against"]].to_numpy().tolist() == [[harder[0], f"{harder[1]} (best peer)"]]
 
 
+def test_a_changed_guided_column_is_compared_with_itself_unchanged(tmp_path):
+    changed = "td3_ap:fast[teaching_growth=0]"
+    table = improvement(make(tmp_path, [changed, "td3_ap:fast", "ddpg_ap:fast", "td3:tuned"]))
+    found = table[["guided", "against"]].to_numpy().tolist()
+    assert found[:2] == [
+        ["td3_ap:fast[teaching_growth=0]", other] for other in ("td3_ap:fast", "td3:tuned (best peer)")
+    ]
+    assert [row for row in found if row[1] == "td3_ap:fast"] == found[:1]
+
+
 def test_the_headline_is_a_table_of_s_and_laps(tmp_path):
     make(tmp_path, ["ddpg_ap:paper", "ddpg:paper", "linear"])
     assert report(tmp_path, "--columns", "ddpg_ap:paper", "ddpg:paper", "linear", name="headline") == 0

@@ -31,8 +31,11 @@ REPORTS = {
     "headline": (["headline"], "the README's table: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "the same of DDPG-AP with one thing changed at a time"),
     "readings": (["readings"], "the same where the paper can be read otherwise"),
+    "lessons": (["lessons"], "the actor taught after every update, not as often as E is fitted"),
     "harder": (["harder"], "the same at 80 km/h, and from random starts, with nothing tuned for it"),
 }
+#: Those of one shape.
+SUMMARIES = ("summary", "ablations", "readings", "lessons", "harder")
 #: Trainings of the paper, by their steps.
 PAPER_STEPS = (3_000, 15_000)
 
@@ -74,7 +77,7 @@ def _add_columns(command: argparse.ArgumentParser, columns: list[str]) -> None:
         default=columns,
         metavar="COLUMN",
         help="algo:preset, algo:preset[key=value,…], linear, or a group: paper, peers, guided, headline, sbx, "
-        "ablations, readings, harder, all; of a task the presets are task, tuned and default",
+        "ablations, readings, lessons, harder, all; of a task the presets are task, tuned and default",
     )
 
 
@@ -173,7 +176,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, known_alone
         "figure5": figures.figure_5,
         "curve": figures.curve,
         "headline": tables.headline,
-        **{kind: partial(summary.summary, name=kind) for kind in ("summary", "ablations", "readings", "harder")},
+        **{kind: partial(summary.summary, name=kind) for kind in SUMMARIES},
         "returns": returns.returns,
     }
     writers[name](results, folder, command_line(options, name))

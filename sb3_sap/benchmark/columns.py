@@ -66,6 +66,12 @@ GROUPS: dict[str, list[str]] = {
             for column in columns
         ),
     ],
+    # the actor taught after every update of its base
+    "lessons": [
+        column
+        for algo in ("ddpg", "td3", "sac", "tqc")
+        for column in (f"{algo}_ap:fast[teaching_growth=0]", f"{algo}_ap:fast", f"{algo}:tuned")
+    ],
     # faster, and from anywhere on the track, with nothing tuned for it
     "harder": [
         *(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_sap.benchmark.columns import PEERS
+from sb3_sap.benchmark.columns import PEERS, Column
 from sb3_sap.benchmark.learners import environment_of
 from sb3_sap.benchmark.measures import (
     THRESHOLDS,
@@ -85,7 +85,7 @@ def _number(value: float, digits: int = 0) -> str:
 
 
 def improvement(results: Results) -> pd.DataFrame:
-    """Each guided column against those of its own base, and against the best peer, in the same environment."""
+    """Each guided column against itself unchanged, its base and the best peer, in the same environment."""
     laps = results.final_laps()
     rows = []
     for ours in results.columns:
@@ -99,7 +99,8 @@ def improvement(results: Results) -> pd.DataFrame:
         if ours.preset == "paper":
             others = [column for column in others if column.preset == "paper"] or others
         others = [column for column in others if column.overrides == ours.overrides] or others
-        for other in dict.fromkeys([*others, *([best] if best else [])]):
+        unchanged = [c for c in alike if ours.overrides and c == Column(ours.algo, ours.preset)]
+        for other in dict.fromkeys([*unchanged, *others, *([best] if best else [])]):
             estimate = probability_of_improvement(score_matrix(laps, ours.name), score_matrix(laps, other.name))
             best_mark = " (best peer)" if other == best else ""
             rows.append([ours.name, other.name + best_mark, *estimate])

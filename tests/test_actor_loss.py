@@ -139,6 +139,7 @@ def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, growt
 @pytest.mark.parametrize(("growth", "last"), [(None, 59), (0.0, 100)])
 def test_it_ends_with_guidance_unless_it_has_a_rhythm_of_its_own(monkeypatch, growth, last):
     steps = []
+    monkeypatch.setattr(DDPGAP, "predictor_suffices", True)
     model = build(DDPGAP, actor_permissibility_coef=1.0, guidance_end=60, teaching_growth=growth)
     monkeypatch.setattr(
         "sb3_sap.exploration.permissible_actor_step", lambda *args: steps.append(model.num_timesteps) or 0.0

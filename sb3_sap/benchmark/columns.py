@@ -66,11 +66,11 @@ GROUPS: dict[str, list[str]] = {
             for column in columns
         ),
     ],
-    # the actor taught after every update of its base
+    # the actor taught after every update of its base, or as often as E is fitted and as long as there is guidance
     "lessons": [
-        column
-        for algo in ("ddpg", "td3", "sac", "tqc")
-        for column in (f"{algo}_ap:fast[teaching_growth=0]", f"{algo}_ap:fast", f"{algo}:tuned")
+        *("ddpg_ap:fast", "ddpg_ap:fast[teaching_growth=null]", "ddpg:tuned"),
+        *("td3_ap:fast", "td3_ap:fast[teaching_growth=null]", "td3:tuned"),
+        *("sac_ap:fast[teaching_growth=0]", "sac_ap:fast", "sac:tuned"),
     ],
     # faster, and from anywhere on the track, with nothing tuned for it
     "harder": [

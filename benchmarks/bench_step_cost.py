@@ -20,12 +20,11 @@ import pandas as pd
 import torch as th
 
 import sb3_sap.exploration
-from sb3_sap.benchmark.columns import parse_column
-from sb3_sap.benchmark.learners import algorithm_class, make_model
+from sb3_sap.benchmark.columns import Column, parse_column
+from sb3_sap.benchmark.learners import algorithm_class, make_model, settings_of
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
 from sb3_sap.benchmark.provenance import provenance
 from sb3_sap.callbacks import PermissibilityCallback
-from sb3_sap.presets import preset
 
 PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
@@ -80,9 +79,9 @@ def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
 def measure(pair: str, steps: int) -> dict[str, object]:
     """One row: milliseconds a step of both models, and of the guided one's parts."""
     column = parse_column(pair)
-    base, guided = column.algo, f"{column.algo}_ap"
-    settings = preset(column.preset, guided, steps) | column.changes
-    models = [build(algo, settings) for algo in (base, guided)]
+    guided = Column(f"{column.algo}_ap", column.preset, column.overrides)
+    settings = settings_of(guided, "torcs", steps)
+    models = [build(algo, settings) for algo in (column.algo, guided.algo)]
     spent = [0.0, 0.0]
     seconds.clear()
     for done in range(0, steps, CHUNK):
@@ -92,9 +91,9 @@ def measure(pair: str, steps: int) -> dict[str, object]:
             spent[number] += (time.process_time() - begun) * (done > 0)  # what comes first is warming up
     predictor: Any = models[1].predictor
     seconds["E's matrix products"] = int(predictor.n_updates) * products_of_a_batch(predictor)
-    alone, together = (1000 * each / (steps - CHUNK) for each in spent)
-    row: dict[str, object] = {"pair": pair, "base, ms": f"{alone:.2f}", "guided, ms": f"{together:.2f}"}
-    row["ratio"] = f"{together / alone:.2f}"
+    alone, with_e = (1000 * each / (steps - CHUNK) for each in spent)
+    row: dict[str, object] = {"pair": pair, "base, ms": f"{alone:.2f}", "guided, ms": f"{with_e:.2f}"}
+    row["ratio"] = f"{with_e / alone:.2f}"
     return row | {f"{part}, ms": f"{1000 * seconds[part] / steps:.2f}" for part in (*PARTS, "E's matrix products")}
 
 

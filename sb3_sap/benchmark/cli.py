@@ -34,7 +34,7 @@ REPORTS = {
     "lessons": (["lessons"], "the actor taught after every update, or as often as E is fitted"),
     "harder": (["harder"], "the same at 80 km/h, and from random starts, with nothing tuned for it"),
 }
-#: Those of one shape.
+#: Those that are nothing but the statistics of their columns.
 SUMMARIES = ("summary", "ablations", "readings", "lessons", "harder")
 #: Trainings of the paper, by their steps.
 PAPER_STEPS = (3_000, 15_000)

@@ -45,8 +45,8 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     :param actor_permissibility_coef: β of the permissible actor loss, a number, a schedule or ``"lin_1.0"``; 0 is the
         paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`, and for finite actions
         :func:`~sb3_sap.actor_loss.permissible_value_step`). It acts while E is good enough for ``alpha``
-    :param teaching_growth: as ``refit_growth``, of the actor loss and the updates of the base: 0, at each of them, and
-        on after ``guidance_end``. ``None``: as often as E is fitted, as long as there is guidance
+    :param teaching_growth: as ``refit_growth``, of the actor loss and the base's updates of its actor: 0, at each of
+        them, and on after ``guidance_end``. ``None``: as often as E is fitted, as long as there is guidance
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.
@@ -137,8 +137,12 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         if coef == 0 or self.predictor_rests or not self.predictor_suffices:
             return
         step = permissible_value_step if self.discrete else permissible_actor_step
-        growth = self.refit_growth if self.teaching_growth is None else self.teaching_growth
-        for _ in range(due(growth, before, self._n_updates)):
+        if self.teaching_growth is None:
+            lessons = due(self.refit_growth, before, self._n_updates)
+        else:
+            delay = getattr(self, "policy_delay", 1)  # of so many updates of TD3 or CrossQ one moves the actor
+            lessons = due(self.teaching_growth, before // delay, self._n_updates // delay)
+        for _ in range(lessons):
             loss = step(
                 self if self.discrete else self.actor,
                 self.predictor,

@@ -7,7 +7,7 @@ from stable_baselines3.common.utils import set_random_seed
 from torch.nn import functional as F
 from toy import DISCRETE, GUIDED, Line, build
 
-from sb3_sap import DDPGAP, DQNAP, QRDQNAP, SACAP, CrossQAP
+from sb3_sap import DDPGAP, DQNAP, QRDQNAP, SACAP, TD3AP, CrossQAP
 from sb3_sap.actor_loss import permissible_actor_step, permissible_value_step
 from sb3_sap.candidates import action_values
 
@@ -116,17 +116,19 @@ def test_it_waits_until_e_is_good_enough(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("growths", "numbers"),
+    ("algorithm", "growths", "numbers"),
     [
-        ({"refit_growth": 0.25}, [1, 2, 2, 5]),  # to 3, 4, 5 and 9 updates: of these 3, 4, 6, 7 and 9 are due
-        ({"refit_growth": 0.25, "teaching_growth": 0.0}, [1, 2, 3, 7]),
-        ({"teaching_growth": 0.25}, [1, 2, 2, 5]),
+        (DDPGAP, {"refit_growth": 0.25}, [1, 2, 2, 5]),  # to 3, 4, 5 and 9 updates: of these 3, 4, 6, 7 and 9 are due
+        (DDPGAP, {"refit_growth": 0.25, "teaching_growth": 0.0}, [1, 2, 3, 7]),
+        (DDPGAP, {"teaching_growth": 0.25}, [1, 2, 2, 5]),
+        (TD3AP, {}, [1, 2, 3, 7]),
+        (TD3AP, {"teaching_growth": 0.0}, [0, 1, 1, 3]),  # TD3 moves its actor at every second update
     ],
 )
-def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, growths, numbers):
+def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, algorithm, growths, numbers):
     calls = []
     monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
-    model = build(DDPGAP, actor_permissibility_coef=1.0, **growths).learn(60)
+    model = build(algorithm, actor_permissibility_coef=1.0, **growths).learn(60)
     model.validation_accuracy, model._n_updates = 1.0, 2
     calls.clear()
     counted = []

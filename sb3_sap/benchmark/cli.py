@@ -31,7 +31,7 @@ REPORTS = {
     "headline": (["headline"], "the README's table: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "the same of DDPG-AP with one thing changed at a time"),
     "readings": (["readings"], "the same where the paper can be read otherwise"),
-    "lessons": (["lessons"], "the actor taught after every update, or as often as E is fitted"),
+    "lessons": (["lessons"], "the actor taught after every update of it, or as often as E is fitted"),
     "harder": (["harder"], "the same at 80 km/h, and from random starts, with nothing tuned for it"),
 }
 #: Those that are nothing but the statistics of their columns.

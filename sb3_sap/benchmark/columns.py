@@ -66,7 +66,7 @@ GROUPS: dict[str, list[str]] = {
             for column in columns
         ),
     ],
-    # the actor taught after every update of its base, or as often as E is fitted and as long as there is guidance
+    # the actor taught after every update of it, or as often as E is fitted and as long as there is guidance
     "lessons": [
         *("ddpg_ap:fast", "ddpg_ap:default[actor_permissibility_coef=1.0,refit_growth=0.005]", "ddpg:tuned"),
         *("td3_ap:fast", "td3_ap:fast[teaching_growth=null]", "td3:tuned"),

@@ -25,6 +25,8 @@ from sb3_sap.settings import SettingsMixin, check_at_least
 
 #: Of so many fits of E one is left once nothing asks it any more.
 FITS_AFTER_GUIDANCE = 5
+#: Steps between two fits, at most, of an E that teaches in a rhythm of its own: lessons of an old one are wrong.
+STEPS_BETWEEN_FITS = 15
 
 
 class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
@@ -46,7 +48,8 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         paper's method (see :func:`~sb3_sap.actor_loss.permissible_actor_step`, and for finite actions
         :func:`~sb3_sap.actor_loss.permissible_value_step`). It acts while E is good enough for ``alpha``
     :param teaching_growth: as ``refit_growth``, of the actor loss and the base's updates of its actor: 0, at each of
-        them, and on after ``guidance_end``. ``None``: as often as E is fitted, as long as there is guidance
+        them, and on after ``guidance_end``, with E fitted at least every fifteen steps. ``None``: as often as E is
+        fitted, as long as there is guidance
 
     The parameters of :class:`~sb3_sap.learning.LearnedPermissibilityMixin` and
     :class:`~sb3_sap.constraints.ConstrainedExplorationMixin` come on top.
@@ -128,7 +131,9 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         return self.guidance_ended and self.teaching_growth is None
 
     def refits_due(self, before: int, now: int) -> int:
-        return due(self.refit_growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.predictor_rests else 1)
+        if self.teaching_growth is not None:
+            return due(self.refit_growth, before, now, apart=STEPS_BETWEEN_FITS)
+        return due(self.refit_growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.guidance_ended else 1)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates

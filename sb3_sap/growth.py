@@ -7,18 +7,20 @@ from numbers import Real
 from typing import Any
 
 
-def due(growth: float, before: int, now: int, one_of: int = 1) -> int:
+def due(growth: float, before: int, now: int, one_of: int = 1, apart: float = math.inf) -> int:
     """How often work is due after the count ``before``, up to ``now``.
 
     At every count at first, then, once a share of ``growth`` is more than one, as their logarithm.
 
     :param growth: the share, from 0 (at every count) to below 1
     :param one_of: of so many times one is left
+    :param apart: from where a share of ``growth`` is as many counts on, so many lie between two times
     """
 
     def until(count: int) -> int:
-        times = count if growth * count <= 1 else int((1 + math.log(growth * count)) / growth)
-        return times // one_of
+        growing = min(count, apart / growth) if growth else count
+        times = growing if growth * growing <= 1 else (1 + math.log(growth * growing)) / growth
+        return int(times + (count - growing) / apart) // one_of
 
     return until(now) - until(before)
 

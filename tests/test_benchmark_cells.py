@@ -241,6 +241,13 @@ def test_every_class_exists():
             assert make_model(algo, gym.make(env), {"buffer_size": 100}, 0).seed == 0
 
 
+@pytest.mark.parametrize("algo", ["td3", "td3_ap"])
+def test_a_learning_rate_that_falls_is_written_alike_for_the_base(algo):
+    env = gym.make("sap/LaneKeeping-v0", laps=None)
+    model = make_model(algo, env, {"learning_rate": "lin_0.002", "buffer_size": 100}, 0)
+    assert [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == [0.002, 0.001, 0.0]
+
+
 @pytest.mark.parametrize(
     ("info", "how"),
     [

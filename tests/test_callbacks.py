@@ -1,4 +1,5 @@
 import warnings
+from itertools import pairwise
 from unittest.mock import Mock
 
 import numpy as np
@@ -72,6 +73,14 @@ def test_fits_become_rarer_as_steps_grow(growth, steps):
     model = build(DDPGAP, refit_growth=growth)
     assert [now for now in range(1, 13) if model.refits_due(now - 1, now)] == steps
     assert model.refits_due(0, 12) == len(steps)
+
+
+def test_an_e_that_teaches_in_its_own_rhythm_is_never_old():
+    model = build(DDPGAP, refit_growth=0.1, teaching_growth=0.0)
+    fits = [now for now in range(1, 1001) if model.refits_due(now - 1, now)]
+    assert fits[:11] == [*range(1, 11), 12]
+    # A tenth of 150 steps is the limit of 15; without it they would be 100 apart in the end.
+    assert {later - fit for fit, later in pairwise(fits) if fit > 150} == {15}
 
 
 def test_the_callback_asks_how_many_fits_are_due():

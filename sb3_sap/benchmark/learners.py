@@ -19,7 +19,7 @@ from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.features import with_extractor
 from sb3_sap.permissibility import resolve
 from sb3_sap.presets import preset
-from sb3_sap.settings import SettingsMixin, make_action_noise
+from sb3_sap.settings import SettingsMixin, as_schedule, make_action_noise
 
 #: The class of each algorithm, imported only when it is needed.
 CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
@@ -111,8 +111,11 @@ def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> O
     """A fresh model on the processor, where networks this small are fastest."""
     cls = algorithm_class(algo)
     arguments = copy.deepcopy(dict(settings))
-    if isinstance(arguments.get("action_noise"), Mapping) and not issubclass(cls, SettingsMixin):
-        arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
+    if not issubclass(cls, SettingsMixin):  # which reads what YAML can write by itself
+        if isinstance(arguments.get("action_noise"), Mapping):
+            arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
+        if "learning_rate" in arguments:
+            arguments["learning_rate"] = as_schedule(arguments["learning_rate"], "learning_rate")
     if "replay_buffer_class" in arguments:
         arguments["replay_buffer_class"] = resolve(arguments["replay_buffer_class"], "replay_buffer_class")
     if "policy_kwargs" in arguments:

@@ -14,7 +14,7 @@ def due(growth: float, before: int, now: int, one_of: int = 1, apart: float = ma
 
     :param growth: the share, from 0 (at every count) to below 1
     :param one_of: of so many times one is left
-    :param apart: from where a share of ``growth`` is as many counts on, so many lie between two times
+    :param apart: so many counts, at most, lie between two times
     """
 
     def until(count: int) -> int:

@@ -133,7 +133,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
     def refits_due(self, before: int, now: int) -> int:
         if self.teaching_growth is not None:
             return due(self.refit_growth, before, now, apart=STEPS_BETWEEN_FITS)
-        return due(self.refit_growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.guidance_ended else 1)
+        return due(self.refit_growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.predictor_rests else 1)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates

@@ -40,7 +40,9 @@ def permissible_actor_step(
     actions: th.Tensor = actor(observations, deterministic=True) if stochastic else actor(observations)
     loss = coef * F.softplus(-predictor(observations, actions)).mean()
     actor.optimizer.zero_grad()
-    loss.backward(inputs=list(actor.parameters()))  # type: ignore[no-untyped-call]
+    trained = [parameter for parameter in actor.parameters() if parameter.requires_grad]  # some may be frozen
+    if trained:
+        loss.backward(inputs=trained)  # type: ignore[no-untyped-call]
     actor.optimizer.step()
     return loss.item()
 

@@ -80,14 +80,12 @@ class CrossQAP(ActionPermissibilityMixin, CrossQ):
 class DQNAP(ActionPermissibilityMixin, DQN):
     """DQN guided by action permissibility: A_st is every action. Its ε-greedy choice is guided, too."""
 
-    discrete: ClassVar[bool] = True
     stochastic_policy: ClassVar[bool] = True
 
 
 class QRDQNAP(ActionPermissibilityMixin, QRDQN):
     """QR-DQN guided by action permissibility."""
 
-    discrete: ClassVar[bool] = True
     stochastic_policy: ClassVar[bool] = True
 
 

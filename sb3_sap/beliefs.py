@@ -57,7 +57,8 @@ def plot_permissibility(
     :param model: a guided model whose predictor was fitted
     :param variable: index of the state variable in the flattened observation; of a ``Dict``: (key, index)
     :param action: index of the action in the flattened action; a finite action space has one
-    :param obs: the observation whose other variables are held; ``None``: the median of K, or zeros after ``load``
+    :param obs: the observation whose other variables are held; ``None``: one amid those of the training,
+        or zeros, which the picture then says, where none is known
     :param limits: of the variable; ``None``: what K holds without its outermost hundredths, or the space's bounds
     :param variable_name: for the axis
     :param action_name: for the axis
@@ -82,7 +83,11 @@ def plot_permissibility(
         column = None if seen is None else seen[key].reshape(len(seen[key]), -1)[:, index]
         limits = _limits(space.low.flat[index], space.high.flat[index], column)
     values = np.linspace(*limits, RESOLUTION)
-    rows = _typical(model, seen) if obs is None else (obs if isinstance(obs, dict) else {"": obs})
+    held = _typical(model) if obs is None else obs
+    invented = held is None
+    if invented:
+        held = _zeros(model.observation_space)
+    rows = held if isinstance(held, dict) else {"": held}
     rows = {k: np.repeat(np.asarray(v)[None], RESOLUTION, axis=0) for k, v in rows.items()}
     rows[key].reshape(RESOLUTION, -1)[:, index] = values
     if axis is None:
@@ -90,6 +95,8 @@ def plot_permissibility(
     image = draw_beliefs(axis, model, values, rows.get("", rows), action)
     axis.set(xlabel=variable_name or f"observation {f'{key}[{index}]' if key else index}")
     axis.set(ylabel=action_name or ("action" if n_actions == 1 else f"action {action}"))
+    if invented:
+        axis.set_title("the other variables are held at 0, in a state that may not occur", fontsize="small")
     figure = axis.get_figure(root=True)
     assert figure is not None
     figure.colorbar(image, ax=axis, label="E: probability of permissible")
@@ -165,12 +172,17 @@ def _seen(model: Any) -> dict[str, np.ndarray[Any, Any]] | None:
     return {key: store[slots] for key, store in knowledge.observations.items()}
 
 
-def _typical(model: Any, seen: dict[str, np.ndarray[Any, Any]] | None) -> dict[str, np.ndarray[Any, Any]]:
-    space = model.observation_space
+def _typical(model: Any) -> Any:
+    """A raw observation that occurred; None where none is known."""
+    knowledge = model.replay_buffer.knowledge if isinstance(model.replay_buffer, KnowledgeMixin) else None
+    typical = None if knowledge is None else knowledge.typical_observation()
+    return model.typical_observation if typical is None else typical
+
+
+def _zeros(space: Any) -> Any:
     keyed: Any = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    if seen is None:
-        return {key: np.clip(np.zeros(s.shape, s.dtype), s.low, s.high) for key, s in keyed.items()}
-    return {key: np.median(store, axis=0).astype(keyed[key].dtype) for key, store in seen.items()}
+    rows = {key: np.clip(np.zeros(s.shape, s.dtype), s.low, s.high) for key, s in keyed.items()}
+    return rows if isinstance(space, spaces.Dict) else rows[""]
 
 
 def _limits(low: float, high: float, seen: np.ndarray[Any, Any] | None) -> tuple[float, float]:

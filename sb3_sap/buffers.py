@@ -7,15 +7,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_sap.constraints import rows_of
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, ask, labels_from_infos
-
-#: Marks, in a step's ``info``, that its next observation is not known as it was.
-UNKNOWN = "sap_next_obs_unknown"
+from sb3_sap.vec_envs import RAW_LAST, environment_layout
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -24,6 +20,11 @@ class KnowledgeMixin(ReplayBuffer):
     :param knowledge: K, filled with every transition added
     :param ap_function: labels the transitions; without it the label is taken from ``info["permissible"]``
     """
+
+    #: The images that the AP function sees channels last (:func:`~sb3_sap.vec_envs.channels_last`).
+    images: tuple[str, ...] = ()
+    #: Whether a transition without a label is an error; else it is left out of K.
+    needs_labels: bool = True
 
     def __init__(
         self, *args: Any, knowledge: KnowledgeBuffer | None = None, ap_function: APFunction | None = None, **kwargs: Any
@@ -47,15 +48,18 @@ class KnowledgeMixin(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         # SB3 hands over raw observations, and the true last one of an episode: here a label is right.
-        if self.ap_function is None:
+        for i, info in enumerate(infos):
+            if RAW_LAST in info:
+                _put(next_obs, i, info[RAW_LAST])
+        if self.ap_function is not None:
+            before, after = (environment_layout(o, self.images) for o in (obs, next_obs))
+            labels = ask(self.ap_function, "ap_function", before, self._unscale(action), after)
+        elif self.needs_labels or any("permissible" in info for info in infos):
             labels = labels_from_infos(infos)
         else:
-            labels = ask(self.ap_function, "ap_function", obs, self._unscale(action), next_obs)
-        actions, pursued = action.reshape(len(labels), -1), obs
-        if self.ap_function is not None and any(UNKNOWN in info for info in infos):
-            known = np.array([UNKNOWN not in info for info in infos])
-            pursued, actions, labels = rows_of(obs, known), actions[known], labels[known]
-        self.knowledge.add(pursued, actions, labels)
+            labels = None
+        if labels is not None:
+            self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -94,12 +98,13 @@ GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
 }
 
 
-def reaches_clip(env: VecNormalize, observation: Any) -> bool:
-    """Whether a normalised observation may have been clipped, so that the raw one cannot be had back."""
-    if not env.norm_obs:
-        return False
-    parts = [observation[key] for key in env.norm_obs_keys or ()] if isinstance(observation, dict) else [observation]
-    return any((np.abs(part) >= env.clip_obs).any() for part in parts)
+def _put(observations: Any, row: int, obs: Any) -> None:
+    """Writes one observation into a batch."""
+    if isinstance(observations, dict):
+        for key, batch in observations.items():
+            batch[row] = obs[key]
+    else:
+        observations[row] = obs
 
 
 def guided_buffer_class(

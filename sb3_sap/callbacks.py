@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -56,6 +57,8 @@ class PermissibilityCallback(BaseCallback):
         if new.any():
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
         due = self.model.refits_due(self._start // self.model.n_envs, self.model.life_steps // self.model.n_envs)
+        if self.model.refit_growth is None and self.model.gradient_steps >= 0:
+            due = min(due, max(1, self.model.gradient_steps))  # no more often than the base trains
         if min(knowledge.counts("train")) >= self.model.min_per_class:
             for _ in range(due):
                 self.fit()
@@ -101,6 +104,15 @@ def contains_permissibility_callback(callback: object) -> bool:
     if isinstance(callback, EventCallback):
         _refuse_inside(callback)
     return False
+
+
+def every_callback(callback: BaseCallback) -> Iterator[BaseCallback]:
+    """A callback and all that it holds."""
+    yield callback
+    for name, value in vars(callback).items():
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, BaseCallback) and name != "parent":
+                yield from every_callback(child)
 
 
 def _refuse_inside(event: EventCallback) -> None:

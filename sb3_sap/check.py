@@ -12,11 +12,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 
+from sb3_sap.action_spaces import check_action_space
 from sb3_sap.advice import advise, describe
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, BoolArray, ask, copy_observation, labels_from_infos, resolve
 from sb3_sap.predictor import PermissibilityPredictor
-from sb3_sap.settings import check_action_space
 
 #: States at which a sweep of actions is tried, each this many random steps or fewer after a reset.
 N_STATES, MAX_PREFIX = 16, 20

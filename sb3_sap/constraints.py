@@ -15,6 +15,7 @@ from sb3_sap.candidates import candidate_actions, choose
 from sb3_sap.generators import make_rng
 from sb3_sap.permissibility import BoolArray, FloatArray, Observations, ask, resolve
 from sb3_sap.settings import SettingsMixin, check_at_least
+from sb3_sap.vec_envs import environment_layout
 
 
 class ActionConstraint(Protocol):
@@ -102,6 +103,11 @@ class ConstrainedExplorationMixin(SettingsMixin):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
         action, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
+        if scaled.shape != (n_envs, *cast(Any, self.action_space).shape):
+            raise ValueError(
+                f"`action_noise` turned {n_envs} actions of {self.action_space} into an array of shape {scaled.shape}: "
+                "give a noise whose mean and sigma have the shape of one action."
+            )
         if self._constraint is not None:
             low, high = self._allowed_interval(n_envs)
             outside = ((scaled < low) | (scaled > high)).reshape(n_envs, -1).any(axis=1)
@@ -155,7 +161,8 @@ class ConstrainedExplorationMixin(SettingsMixin):
         return low, high
 
     def _raw_last_obs(self) -> Any:
-        return self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        raw = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        return environment_layout(raw, self.images)
 
     def _store_transition(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ from sb3_sap.permissibility import FloatArray, Observations
 
 NON_PERMISSIBLE, PERMISSIBLE = 0, 1
 CLASSES = (NON_PERMISSIBLE, PERMISSIBLE)
+#: Observations, at most, among which a typical one is looked for.
+TYPICAL = 1_000
 Part = Literal["train", "validation"]
 
 
@@ -120,6 +123,31 @@ class KnowledgeBuffer:
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts.values())
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What pickle writes: of the arrays only the rows that hold something, which are the first of each part."""
+        filled = self._filled()
+        rows = {key: store[filled] for key, store in self.observations.items()}
+        return {**vars(self), "observations": rows, "actions": self.actions[filled]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        filled = self._filled()
+
+        def whole(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+            if len(rows) == self.size:  # all of it is filled, or an earlier version wrote it in full
+                return rows
+            store = np.zeros((self.size, *rows.shape[1:]), rows.dtype)
+            store[filled] = rows
+            return store
+
+        self.observations = {key: whole(rows) for key, rows in self.observations.items()}
+        self.actions = whole(self.actions)
+
+    def _filled(self) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """The rows that hold a tuple."""
+        parts: tuple[Part, Part] = ("train", "validation")
+        return np.concatenate([self._offset[part] + np.arange(len(self.parts[part])) for part in parts])
+
     def seed(self, seed: int | None) -> None:
         """Restarts the generator that splits and samples."""
         self.rng = make_rng(seed, "knowledge")
@@ -144,6 +172,24 @@ class KnowledgeBuffer:
                 store[slot] = keyed[key][i]
             self.actions[slot] = actions[i]
             self.seen[int(label)] += 1
+
+    def typical_observation(self) -> Any:
+        """The raw observation of K that lies nearest to the median of them; None where there is none.
+
+        A median itself need not be any possible state, such as the sine and cosine of an angle.
+        """
+        slots = np.concatenate([self.parts["train"].slots(label) for label in CLASSES])
+        if len(slots) == 0:
+            return None
+        slots = slots[:: math.ceil(len(slots) / TYPICAL)]
+        distance = np.zeros(len(slots))
+        for store in self.observations.values():
+            rows = store[slots].reshape(len(slots), -1).astype(np.float64)
+            spread = rows.std(axis=0)
+            distance += (np.abs(rows - np.median(rows, axis=0)) / np.where(spread > 0, spread, 1)).sum(axis=1)
+        nearest = slots[distance.argmin()]
+        row = {key: store[nearest].copy() for key, store in self.observations.items()}
+        return row if self._keyed else row[""]
 
     def sample(
         self, n: int, part: Part = "train", env: VecNormalize | None = None, balanced: bool = True

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any
+import warnings
+from collections.abc import Iterable
+from typing import Any, cast
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_sap.buffers import UNKNOWN, KnowledgeMixin, guided_buffer_class, reaches_clip
-from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
+from sb3_sap.buffers import KnowledgeMixin, guided_buffer_class
+from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback, every_callback
 from sb3_sap.features import with_extractor
 from sb3_sap.generators import make_rng
 from sb3_sap.growth import check_growth, due
@@ -22,7 +25,17 @@ from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, resolve
 from sb3_sap.predictor import PermissibilityPredictor
 from sb3_sap.settings import SettingsMixin, check_at_least
+from sb3_sap.vec_envs import never_updated, shares_environment, watched_steps
 
+#: Arguments of the predictor that its saved weights and optimizer depend on.
+BUILT = (
+    "net_arch",
+    "activation_fn",
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "normalize_images",
+    "optimizer_class",
+)
 #: Validation accuracy from which E is good enough (section 4.3).
 SUFFICIENT_ACCURACY = 0.7
 
@@ -39,8 +52,10 @@ class LearnedPermissibilityMixin(SettingsMixin):
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
     :param min_per_class: examples of each class that K must hold before E is fitted, and makes room for when it is full
-    :param refit_growth: E is fitted and validated each time that the steps taken have grown by this share, for what few
-        new examples can change in it is soon little, but the cost of a fit stays; 0, the paper's, at every step
+    :param refit_growth: E is fitted and validated each time that the number of steps has grown by this fraction,
+        because a few new examples soon change little in it, while the cost of a fit stays; 0, the paper's: at every
+        step. ``None``: at every step too, but no more often than the base trains, which matters where one gradient
+        step follows several environment steps, as with DQN
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
     """
 
@@ -53,7 +68,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
         dataset_size: int = 512,
         validation_size: int = 200,
         min_per_class: int = 20,
-        refit_growth: float = 0.0,
+        refit_growth: float | None = None,
         predictor_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -68,13 +83,19 @@ class LearnedPermissibilityMixin(SettingsMixin):
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
         self._steps_of_earlier_learns = 0
+        self._warned_of_sharing = False
+        #: A raw observation amid those of the training, noted when the model is saved.
+        self.typical_observation: Any = None
+        #: What the predictor was built with: a saved one fits no other.
+        self._predictor_built: dict[str, str] = {}
         #: Whether the observations of the last training were normalised.
         self.learned_normalised = False
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         check_at_least(self, knowledge_buffer_size=4, min_per_class=1, dataset_size=2, validation_size=2)
-        check_growth(self, "refit_growth")
+        if self.refit_growth is not None:
+            check_growth(self, "refit_growth")
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
@@ -84,10 +105,12 @@ class LearnedPermissibilityMixin(SettingsMixin):
         super()._setup_model()
         self.replay_buffer_kwargs = own
         self.replay_buffer_class = type(self.replay_buffer)
+        self._connect(cast(KnowledgeMixin, self.replay_buffer))
         # A network of our own must not shift the global generator, or runs would no longer compare to the base's.
         with th.random.fork_rng(devices=[]):
             th.default_generator.manual_seed(int(make_rng(self.seed, "predictor").integers(2**31)))
             self.predictor = self._make_predictor().to(self.device)
+        self._check_normalisation()
 
     def _make_replay_buffer(self) -> KnowledgeMixin:
         buffer_class = guided_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
@@ -118,12 +141,15 @@ class LearnedPermissibilityMixin(SettingsMixin):
             n_envs=self.n_envs,
             optimize_memory_usage=self.optimize_memory_usage,
             knowledge=knowledge,
-            ap_function=self._resolved_ap_function(),
             **kwargs,
         )
 
-    def _resolved_ap_function(self) -> APFunction | None:
-        return None if self.ap_function is None else resolve(self.ap_function, "ap_function")
+    def _connect(self, buffer: KnowledgeMixin) -> None:
+        """Tells a buffer where its labels come from."""
+        buffer.ap_function = None if self.ap_function is None else resolve(self.ap_function, "ap_function")
+        buffer.images = self.images
+        # What is ruled out beforehand can do without labels of what was executed.
+        buffer.needs_labels = getattr(self, "permissible_actions", None) is None
 
     def _make_predictor(self) -> PermissibilityPredictor:
         # Unless told otherwise E turns observations into features as the policy does.
@@ -137,6 +163,15 @@ class LearnedPermissibilityMixin(SettingsMixin):
             raise TypeError(
                 f"`predictor_kwargs` holds {name!r}, but PermissibilityPredictor takes {', '.join(list(known)[2:])}."
             )
+        built = {name: str(arguments.get(name, known[name].default)) for name in BUILT}
+        changed = [name for name in BUILT if self._predictor_built.get(name, built[name]) != built[name]]
+        if changed:
+            raise ValueError(
+                f"`predictor_kwargs` change {', '.join(changed)} of a saved predictor, whose weights and optimizer "
+                f"fit no other: build a new {type(self).__name__} with them, and give it the loaded policy with "
+                "`new.policy.load_state_dict(loaded.policy.state_dict())`."
+            )
+        self._predictor_built = built
         return PermissibilityPredictor(self.observation_space, self.action_space, **arguments)
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -150,7 +185,11 @@ class LearnedPermissibilityMixin(SettingsMixin):
             if not isinstance(callback, (list, BaseCallback)):
                 callback = ConvertCallback(callback)
             callback = [PermissibilityCallback(), *(callback if isinstance(callback, list) else [callback])]
-        return super()._init_callback(callback, progress_bar)
+        callback = super()._init_callback(callback, progress_bar)
+        for one in every_callback(callback):
+            if any(shares_environment(cast(VecEnv, self.env), value) for value in vars(one).values()):
+                self._warn_of_shared_environment(f"{type(one).__name__}")
+        return callback
 
     def _setup_learn(
         self,
@@ -162,7 +201,8 @@ class LearnedPermissibilityMixin(SettingsMixin):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self._steps_of_earlier_learns += self.num_timesteps
-        self.learned_normalised = self._vec_normalize_env is not None
+        normalize = self._vec_normalize_env
+        self.learned_normalised = normalize is not None and normalize.norm_obs
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     @property
@@ -170,33 +210,65 @@ class LearnedPermissibilityMixin(SettingsMixin):
         """Steps taken over the model's whole life."""
         return self._steps_of_earlier_learns + self.num_timesteps
 
-    def _store_transition(
-        self,
-        replay_buffer: Any,
-        buffer_action: np.ndarray[Any, Any],
-        new_obs: Any,
-        reward: np.ndarray[Any, Any],
-        dones: np.ndarray[Any, Any],
-        infos: list[dict[str, Any]],
-    ) -> None:
-        # Of an episode's last observation VecNormalize keeps the clipped value alone, which nothing can be told from.
-        if self._vec_normalize_env is not None:
-            for info in infos:
-                last = info.get("terminal_observation")
-                if last is not None and reaches_clip(self._vec_normalize_env, last):
-                    info[UNKNOWN] = True
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """SB3's ``collect_rollouts``, which keeps last observations as they were and notices foreign steps."""
+        before = self.num_timesteps
+        with watched_steps(env, self._vec_normalize_env) as calls:
+            rollout = super().collect_rollouts(env, *args, **kwargs)
+        if calls[0] > (self.num_timesteps - before) // self.n_envs:
+            self._warn_of_shared_environment("a callback")
+        return rollout
+
+    def _warn_of_shared_environment(self, who: str) -> None:
+        if not self._warned_of_sharing:
+            self._warned_of_sharing = True
+            warnings.warn(
+                f"The training environment is also used by {who}, and stepping or resetting it there leaves "
+                "transitions that never happened in both buffers: evaluate in an environment of its own.",
+                stacklevel=2,
+            )
 
     def refits_due(self, before: int, now: int) -> int:
         """How many fits belong to the steps after ``before``, up to ``now``."""
-        return due(self.refit_growth, before, now)
+        return due(self.refit_growth or 0.0, before, now)
 
     @property
     def predictor_suffices(self) -> bool:
         """Whether E was right often enough on its last validation sample."""
         return self.validation_accuracy >= SUFFICIENT_ACCURACY
 
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        self._check_normalisation()
+        if isinstance(self.replay_buffer, KnowledgeMixin):
+            self._connect(self.replay_buffer)
+
+    def _check_normalisation(self) -> None:
+        """Warns of an environment whose observations are not those that a loaded model learned from."""
+        if not self.learned_normalised or self.env is None:
+            return
+        normalize = self._vec_normalize_env
+        if normalize is None or not normalize.norm_obs:
+            warnings.warn(
+                "This model learned from normalised observations, but its environment gives raw ones, with which it "
+                "acts at random: wrap it in VecNormalize.load(statistics, env), with the statistics of the training.",
+                stacklevel=2,
+            )
+        elif never_updated(normalize):
+            warnings.warn(
+                "This model learned from normalised observations, but the statistics of this VecNormalize are those of "
+                "no observation at all: load them with VecNormalize.load(statistics, env).",
+                stacklevel=2,
+            )
+
     # ---------------------------------------------------------------- saving
+
+    def save(self, path: Any, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> None:
+        """SB3's ``save``."""
+        if isinstance(self.replay_buffer, KnowledgeMixin):
+            seen = self.replay_buffer.knowledge.typical_observation()
+            self.typical_observation = self.typical_observation if seen is None else seen
+        super().save(path, exclude, include)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
@@ -216,16 +288,44 @@ class LearnedPermissibilityMixin(SettingsMixin):
                 f"These parameters hold no AP predictor, so a plain algorithm saved them: build {type(self).__name__} "
                 "with the same settings and call `model.set_parameters(path, exact_match=False)` to go on from them."
             )
+        optimizer = self.predictor.optimizer
+        own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
+        for group in load_path_or_dict.get("predictor.optimizer", {"param_groups": []})["param_groups"]:
+            if group.keys() - {"params"} != own[0].keys():
+                raise TypeError(
+                    f"These parameters hold the state of another optimizer than the predictor's "
+                    f"{type(optimizer).__name__}: build the model with the `predictor_kwargs` of the saved one."
+                )
         super().set_parameters(load_path_or_dict, exact_match, device)
+        # The file brings the optimizer's running averages; its settings are those of this model.
+        for group, settings in zip(optimizer.param_groups, own, strict=True):
+            group.update(settings)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded = self.replay_buffer
-        if not isinstance(loaded, KnowledgeMixin):
+        loaded: Any = self.replay_buffer
+        try:
+            self._check_loaded(loaded)
+        except (TypeError, ValueError):
             self.replay_buffer = own
+            raise
+        self._connect(loaded)
+
+    def _check_loaded(self, loaded: Any) -> None:
+        if not isinstance(loaded, KnowledgeMixin):
             raise TypeError(
                 f"The file holds a plain {type(loaded).__name__} without a knowledge buffer: "
                 f"load one saved by {type(self).__name__}."
             )
-        loaded.ap_function = self._resolved_ap_function()
+        if loaded.n_envs != self.n_envs:
+            raise ValueError(
+                f"The file holds a replay buffer of {loaded.n_envs} environments, but this model has {self.n_envs}: "
+                "load the model with as many environments, or go on with an empty buffer."
+            )
+        for name in ("observation_space", "action_space"):
+            if getattr(loaded, name) != getattr(self, name):
+                raise ValueError(
+                    f"The file holds a replay buffer whose {name} is {getattr(loaded, name)}, but this model's is "
+                    f"{getattr(self, name)}: load one that was saved in the same environment."
+                )

@@ -9,6 +9,7 @@ import torch as th
 
 from sb3_sap.candidates import candidate_actions, choose
 from sb3_sap.predictor import candidate_logits, flush_denormals
+from sb3_sap.vec_envs import environment_layout, policy_layout, unnormalized
 
 if TYPE_CHECKING:
     from sb3_sap.exploration import ActionPermissibilityMixin
@@ -51,9 +52,10 @@ def guided_prediction(
             "`permissible_actions` judges observations as the environment gives them, but this model takes normalised "
             "ones and has no statistics to undo that: load it with its VecNormalize, `load(path, env=...)`."
         )
-    raw = observation if env is None else env.unnormalize_obs(observation)
+    seen = policy_layout(observation, model.observation_space)
     if not is_batch:
-        raw = {key: value[None] for key, value in raw.items()} if isinstance(raw, dict) else np.asarray(raw)[None]
+        seen = {key: value[None] for key, value in seen.items()} if isinstance(seen, dict) else seen[None]
+    raw = environment_layout(seen if env is None else unnormalized(env, seen, model.observation_space), model.images)
     proposed = np.asarray(actions).reshape(-1, *shape)
     if not model.discrete:
         proposed = model.policy.scale_action(proposed)

@@ -93,6 +93,9 @@ class PermissibilityPredictor(BaseModel):
         self.features_extractor = self.make_features_extractor()
         n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
         self.head = nn.Sequential(*create_mlp(n_inputs, 1, list(net_arch), activation_fn))
+        self._normalises_batches = any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in self.modules())
+        # Of layers that draw at random while training, such as dropout: one seed for each fit follows from it.
+        self._seed = th.initial_seed()
         # Buffers are saved with the weights: a loaded E knows whether it was ever fitted.
         self.register_buffer("n_updates", th.zeros((), dtype=th.long))
         # The gradient of the L2 term λ/2 ‖θ_E‖² is λ θ_E, which torch.optim calls weight decay.       # Eq. (7)
@@ -102,6 +105,8 @@ class PermissibilityPredictor(BaseModel):
             weight_decay=weight_decay,
             **self.optimizer_kwargs,
         )
+        # But for a fit, everything asks E for verdicts, one state at a time among it.
+        self.set_training_mode(False)
 
     @property
     def fitted(self) -> bool:
@@ -135,16 +140,39 @@ class PermissibilityPredictor(BaseModel):
         """
         obs, actions, labels = self._to_tensors(dataset)
         losses = []
-        for start in range(0, len(labels), self.batch_size):
-            batch = slice(start, start + self.batch_size)
-            obs_batch = {key: value[batch] for key, value in obs.items()} if isinstance(obs, dict) else obs[batch]
-            loss = self.loss(obs_batch, actions[batch], labels[batch])
-            self.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimizer.step()
-            losses.append(loss.item())
+        with self._training():
+            for batch in self._batches(len(labels)):
+                obs_batch = {key: value[batch] for key, value in obs.items()} if isinstance(obs, dict) else obs[batch]
+                loss = self.loss(obs_batch, actions[batch], labels[batch])
+                self.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                self.optimizer.step()
+                losses.append(loss.item())
         self.n_updates += len(losses)
         return float(np.mean(losses))
+
+    @contextmanager
+    def _training(self) -> Iterator[None]:
+        """Training mode for a while, whose random layers leave the global generators alone."""
+        cuda = self.device.type == "cuda"
+        seed = (self._seed + int(self.n_updates)) % 2**63
+        with th.random.fork_rng(devices=[self.device] if cuda else []):
+            th.default_generator.manual_seed(seed)
+            if cuda:
+                th.cuda.manual_seed(seed)
+            self.set_training_mode(True)
+            try:
+                yield
+            finally:
+                self.set_training_mode(False)
+
+    def _batches(self, n: int) -> Iterator[slice]:
+        """Mini-batches of n rows."""
+        starts = list(range(0, n, self.batch_size))
+        if self._normalises_batches and n % self.batch_size == 1 and len(starts) > 1:
+            starts.pop()  # a row on its own has no variance: it goes with those before it
+        for start, end in zip(starts, [*starts[1:], n], strict=True):
+            yield slice(start, end)
 
     @th.no_grad()
     @flush_denormals()

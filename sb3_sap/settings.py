@@ -4,27 +4,42 @@ from __future__ import annotations
 
 import inspect
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from io import BufferedIOBase
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, ClassVar, Self, cast
 
+import cloudpickle
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib import QRDQN
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sap.action_spaces import check_action_space, check_observation_space
 from sb3_sap.features import with_extractor
+from sb3_sap.vec_envs import channels_last, check_wrappers
 
 #: Training steps of the paper's main experiment (section 5.2).
 PAPER_STEPS = 15_000
 #: RL Zoo's way to write a schedule that falls evenly to 0.
 LINEAR = r"lin_\d+\.?\d*(e-?\d+)?"
+#: Arguments that are functions of the user's.
+FUNCTIONS = ("ap_function", "constraint", "permissible_actions")
 NOISES: dict[str, Callable[..., ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -42,7 +57,7 @@ class SettingsMixin(OffPolicyAlgorithm):
     :param policy_kwargs: SB3's; ``features_extractor_class`` may be a dotted name
     """
 
-    #: Whether the algorithm chooses among finitely many actions.
+    #: Whether the algorithm chooses among finitely many actions; known of SB3's and sb3-contrib's bases.
     discrete: ClassVar[bool] = False
     #: Settings that may be numbers, schedules or ``"lin_<number>"``.
     schedules: ClassVar[tuple[str, ...]] = ("learning_rate", "actor_learning_rate")
@@ -56,9 +71,12 @@ class SettingsMixin(OffPolicyAlgorithm):
         **kwargs: Any,
     ):
         self.actor_learning_rate: Any = actor_learning_rate
+        #: The images that the environment gives channels last, and the user's functions see so.
+        self.images: tuple[str, ...] = ()
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             check_action_space(type(self).__name__, env.action_space, self.discrete)
+            check_observation_space(type(self).__name__, env.observation_space)
         # SB3 writes into the dictionaries that it is given.
         kwargs["replay_buffer_kwargs"] = dict(kwargs.get("replay_buffer_kwargs") or {})
         kwargs["policy_kwargs"] = with_extractor(kwargs.get("policy_kwargs"))
@@ -66,6 +84,13 @@ class SettingsMixin(OffPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
+        if any(base is OnPolicyAlgorithm for base in cls.__mro__):
+            raise TypeError(
+                f"{cls.__name__} puts {cls.__bases__[0].__name__} before an on-policy algorithm, which has no replay "
+                "buffer to learn from: choose an off-policy one, such as SAC or DQN."
+            )
+        if issubclass(cls, (DQN, QRDQN)):
+            cls.discrete = True
         # The constructors here pass *args and **kwargs on; editors and API pages show the whole list.
         cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
 
@@ -76,12 +101,36 @@ class SettingsMixin(OffPolicyAlgorithm):
         action_noise: Any = self.action_noise
         if isinstance(action_noise, Mapping):
             self.action_noise = make_action_noise(action_noise, self.action_space)
+        elif isinstance(action_noise, VectorizedActionNoise) and action_noise.n_envs != self.n_envs:
+            # Saved with other environments: SB3 makes one for these when it learns.
+            self.action_noise = action_noise.base_noise
+        self._look_at(self.env)
+        self._unsaved = [name for name in FUNCTIONS if not can_be_pickled(getattr(self, name, None))]
+        for name in self._unsaved:
+            warnings.warn(
+                f"`{name}` {getattr(self, name)!r} cannot be pickled, so that saved models will not hold it: give a "
+                f"function of a module or its dotted name, or pass it again, `load(path, {name}=...)`.",
+                stacklevel=2,
+            )
         super()._setup_model()
         if self.discrete and self.actor_learning_rate is not None:
             raise ValueError(
                 f"`actor_learning_rate` = {self.actor_learning_rate!r}, but {type(self).__name__} has no actor: "
                 "set `learning_rate`."
             )
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self._unsaved]
+
+    def _look_at(self, env: VecEnv | None) -> None:
+        """Takes from an environment's wrappers what the user's functions have to see."""
+        if env is not None:
+            check_wrappers(env)
+            self.images = channels_last(env)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        self._look_at(self.env)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)
@@ -121,9 +170,9 @@ class SettingsMixin(OffPolicyAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> Self:
-        """SB3's ``load``, which says so when a file was cut short."""
+        """SB3's ``load``, which says so when a file was cut short, and heeds a new ``seed``."""
         try:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except AssertionError as error:
             # Cut short behind one of torch's files, which are archives themselves, a file still passes for an archive.
             if "in the saved file" not in str(error):
@@ -131,27 +180,18 @@ class SettingsMixin(OffPolicyAlgorithm):
             raise ValueError(
                 f"The file {path} holds no whole model: was it cut short, or not written by save?"
             ) from error
+        if kwargs.get("seed") is not None:
+            model.set_random_seed(kwargs["seed"])  # in place of the generators that the file holds
+        return model
 
 
-def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool) -> None:
-    """Refuses, in one sentence, an action space that the algorithm cannot use."""
-    if discrete:
-        if not isinstance(space, spaces.Discrete):
-            raise ValueError(
-                f"{algorithm} needs an `env` with a finite (Discrete) action space, but this one's is {space}: choose "
-                "an algorithm for that space."
-            )
-        return
-    if not isinstance(space, spaces.Box):
-        raise ValueError(
-            f"{algorithm} needs an `env` with a continuous (Box) action space, but this one's is {space}: choose an "
-            "algorithm for that space."
-        )
-    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-        raise ValueError(
-            f"{algorithm} needs an `env` whose actions are bounded, but this one's action space is {space}: wrap it in "
-            "gymnasium.wrappers.RescaleAction or set finite bounds."
-        )
+def can_be_pickled(value: Any) -> bool:
+    """Whether a saved model can hold a value."""
+    try:
+        cloudpickle.dumps(value)
+    except Exception:  # whatever an object's own pickling raises
+        return False
+    return True
 
 
 def check_at_least(model: Any, **minima: int) -> None:

@@ -38,16 +38,27 @@ class NoCallback(BaseCallback):
     ("settings", "n_envs", "expected"),
     [
         ({"train_freq": 1}, 1, [8, 9, 10, 11, 12]),
-        ({"train_freq": 4}, 1, [8] * 4 + [12] * 4),
-        ({"train_freq": (1, "episode")}, 1, [5] * 5 + [10] * 5 + [15] * 5),
-        # One fit for each vectorised step, after which two transitions are new.
-        ({"train_freq": 2}, 2, [8] * 2 + [12] * 2),
+        # As often as the base trains,
+        ({"train_freq": 4}, 1, [8, 12]),
+        ({"train_freq": 4, "gradient_steps": 2}, 1, [8, 8, 12, 12]),
+        ({"train_freq": 4, "gradient_steps": 9}, 1, [8] * 4 + [12] * 4),
+        ({"train_freq": 4, "gradient_steps": -1}, 1, [8] * 4 + [12] * 4),
+        ({"train_freq": (1, "episode")}, 1, [5, 10, 15]),
+        ({"train_freq": 2}, 2, [8, 12]),
+        # or at every step,
+        ({"train_freq": 4, "refit_growth": 0.0}, 1, [8] * 4 + [12] * 4),
+        ({"train_freq": (1, "episode"), "refit_growth": 0.0}, 1, [5] * 5 + [10] * 5 + [15] * 5),
+        # which is a vectorised step, after which two transitions are new.
+        ({"train_freq": 2, "refit_growth": 0.0}, 2, [8] * 2 + [12] * 2),
+        ({"train_freq": 1}, 2, [8, 10, 12]),
+        # A base that never trains leaves E its own fits.
+        ({"train_freq": 1, "gradient_steps": 0}, 1, [8, 9, 10, 11, 12]),
     ],
 )
 def test_fits_follow_the_steps_collected(settings, n_envs, expected):
     callback = Recorder()
     env = DummyVecEnv([lambda: Line(horizon=5)] * n_envs)
-    model = build(DDPGAP, env, seed=1, min_per_class=1, gradient_steps=1, **settings)
+    model = build(DDPGAP, env, seed=1, min_per_class=1, **{"gradient_steps": 1} | settings)
     # The first two labels of each class may come late: give K one of each before the run.
     knowledge = model.replay_buffer.knowledge
     while min(knowledge.counts("train") + knowledge.counts("validation")) == 0:

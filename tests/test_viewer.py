@@ -2,6 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
+import pygame
 import pytest
 from numpy.typing import NDArray
 
@@ -9,6 +10,7 @@ import sb3_sap  # noqa: F401  # registers the environment
 from sb3_sap.envs import CarState, get_track
 from sb3_sap.envs.tracks import Segment, Track
 from sb3_sap.envs.viewer import ACCENT, ASPHALT, CAR, GRASS, SCALING, SIZE, Viewer
+from sb3_sap.evaluation import make_env
 
 MIDDLE = (SIZE[1] // 2, SIZE[0] // 2)
 """Row and column."""
@@ -95,18 +97,57 @@ def test_environment_renders_what_it_drives() -> None:
     env.close()
 
 
-def test_a_window_opens_and_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> list[pygame.Window]:
+    """Every window that is opened, on a screen that is none."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    import pygame
+    opened: list[pygame.Window] = []
+    window = pygame.Window
+    monkeypatch.setattr(pygame, "Window", lambda *args: opened.append(window(*args)) or opened[-1])
+    return opened
 
+
+def test_a_window_opens_and_closes(windows: list[pygame.Window]) -> None:
     env = gym.make("sap/LaneKeeping-v0", render_mode="human")
     env.reset()
     env.step(np.zeros(1, dtype=np.float32))
-    window = pygame.display.get_surface()
-    assert window is not None
-    assert window.get_at((MIDDLE[1], MIDDLE[0]))[:3] == CAR
+    [window] = windows
+    assert window.get_surface().get_at((MIDDLE[1], MIDDLE[0]))[:3] == CAR
     env.close()
-    assert pygame.display.get_surface() is None
+    with pytest.raises(pygame.error):
+        window.get_surface()
+
+
+def test_two_windows_do_not_draw_into_each_other(windows: list[pygame.Window]) -> None:
+    one, two = (gym.make("sap/LaneKeeping-v0", render_mode="human", track=t) for t in ("wheel-2", "spring"))
+    one.reset()
+    two.reset()
+    titles = [window.title for window in windows]
+    assert titles == ["LaneKeeping · wheel-2", "LaneKeeping · spring"]
+    two.close()
+    one.step(np.zeros(1, dtype=np.float32))
+    assert len(windows) == 2
+    assert windows[0].get_surface().get_at((MIDDLE[1], MIDDLE[0]))[:3] == CAR
+    one.close()
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "human"])
+@pytest.mark.parametrize("another", ["CartPole-v1", "parking-v0"])
+def test_another_environment_that_quits_pygame_takes_nothing_away(
+    windows: list[pygame.Window], mode: str, another: str
+) -> None:
+    ours, other = gym.make("sap/LaneKeeping-v0", render_mode=mode), make_env(another, render_mode="rgb_array")
+    ours.reset()
+    other.reset()
+    before = ours.render()
+    other.render()
+    other.close()
+    pygame.quit()  # whether or not the other one did
+    np.testing.assert_array_equal(before, ours.render())
+    pygame.init()  # a font from before the quit stays dead
+    np.testing.assert_array_equal(before, ours.render())
+    assert len(windows) == (2 if mode == "human" else 0)
+    ours.close()
 
 
 def test_rendering_without_a_mode_warns() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import colorsys
 import math
+from typing import cast
 
 import numpy as np
 import pygame
@@ -57,18 +58,14 @@ class Viewer:
     def __init__(self, track: Track, window: bool = False) -> None:
         self.track = track
         self._lane = _UnrolledTrack(track)
-        pygame.font.init()
-        self._font = pygame.font.Font(None, 22)
+        self._font: pygame.font.Font | None = None
         world_size = (SIZE[0] * OVERSAMPLING, SIZE[1] * OVERSAMPLING)
         self._world = WorldSurface(world_size, 0, pygame.Surface(world_size))
         self._world.scaling = SCALING * OVERSAMPLING
         self._picture = pygame.Surface(SIZE)
         self._map = _Map(track)
-        self._window: pygame.Surface | None = None
-        if window:
-            pygame.display.init()
-            self._window = pygame.display.set_mode(SIZE)
-            pygame.display.set_caption(f"LaneKeeping · {track.name}")
+        self._shown = window
+        self._window: pygame.Window | None = None
 
     def draw(self, state: CarState, steering: float, fan: NDArray[np.floating] | None = None) -> NDArray[np.uint8]:
         """Return the picture of a state, shape (height, width, 3), north up and the car in the middle.
@@ -87,17 +84,40 @@ class Viewer:
         pygame.transform.smoothscale(upright, SIZE, self._picture)
         self._map.draw(self._picture, state.distance)
         self._draw_panel(state, steering)
-        if self._window is not None:
-            pygame.event.pump()
-            self._window.blit(self._picture, (0, 0))
-            pygame.display.flip()
+        if self._shown:
+            self._show()
         return np.ascontiguousarray(pygame.surfarray.array3d(self._picture).swapaxes(0, 1))
 
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._window is not None:
-            pygame.display.quit()
+            self._window.destroy()
             self._window = None
+
+    def _show(self) -> None:
+        # A window of our own, because pygame's display is one for all. Another environment may quit pygame at any time.
+        try:
+            surface = None if self._window is None else self._window.get_surface()
+        except pygame.error:
+            surface = None
+        if surface is None:
+            pygame.display.init()
+            self._window = pygame.Window(f"LaneKeeping · {self.track.name}", SIZE)
+            surface = self._window.get_surface()
+        pygame.event.pump()
+        surface.blit(self._picture, (0, 0))
+        cast(pygame.Window, self._window).flip()
+
+    def _text(self, text: str) -> pygame.Surface:
+        try:
+            font = self._font or pygame.font.Font(None, 22)
+            drawn = font.render(text, True, LINE)
+        except pygame.error:  # never initialised, or quit by another environment since
+            pygame.font.init()
+            font = pygame.font.Font(None, 22)
+            drawn = font.render(text, True, LINE)
+        self._font = font
+        return drawn
 
     def _draw_road(self, distance: float) -> None:
         reach = math.hypot(*SIZE) / SCALING / 2 + self.track.width
@@ -149,7 +169,7 @@ class Viewer:
             f"{state.speed_x:3.0f} km/h     trackPos {state.track_pos:+.2f}     angle {math.degrees(state.angle):+.1f}°"
             f"     {state.distance:,.0f} m"
         )
-        self._picture.blit(self._font.render(text, True, LINE), (MARGIN, top + 10))
+        self._picture.blit(self._text(text), (MARGIN, top + 10))
         # A bar from the middle of its rail shows the steering, to the left where it steers left.
         middle, length, height = SIZE[0] - MARGIN - 60, 60, top + PANEL_HEIGHT // 2
         pygame.draw.line(self._picture, ASPHALT, (middle - length, height), (middle + length, height), 8)

@@ -1,0 +1,99 @@
+"""Which spaces the algorithms can use: refused in one sentence where SB3 would go wrong, or fail later."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+#: Scaled actions that must come back unchanged, and by how much at most they may differ.
+PROBES, TOLERANCE = np.linspace(-1, 1, 9), 1e-3
+
+
+def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool | None) -> None:
+    """Refuses an action space that the algorithm cannot use.
+
+    :param algorithm: its name, for the error message
+    :param discrete: whether it needs a ``Discrete`` space, or a ``Box``; None: it takes either
+    :raise ValueError: with one sentence
+    """
+    kinds = {True: "finite (Discrete)", False: "continuous (Box)", None: "Box or Discrete"}
+    wanted = {True: (spaces.Discrete,), False: (spaces.Box,), None: (spaces.Box, spaces.Discrete)}
+    if not isinstance(space, wanted[discrete]):
+        raise ValueError(
+            f"{algorithm} needs an `env` with a {kinds[discrete]} action space, but this one's is {space}: "
+            f"{_hint(space)}."
+        )
+    if isinstance(space, spaces.Discrete):
+        if space.start != 0:
+            raise ValueError(
+                f"{algorithm} needs actions that count from 0, as SB3's algorithms do, but this `env` has {space}: "
+                f"wrap it in gymnasium.wrappers.TransformAction(env, lambda a: a + {space.start}, "
+                f"gymnasium.spaces.Discrete({space.n}))."
+            )
+    elif isinstance(space, spaces.Box):
+        _check_box(algorithm, space)
+
+
+def _hint(space: spaces.Space[Any]) -> str:
+    if isinstance(space, spaces.Discrete):
+        return "choose DQNAP or QRDQNAP"
+    if isinstance(space, spaces.Box):
+        return "choose an algorithm for continuous actions, such as SACAP"
+    return (
+        "no off-policy algorithm of SB3 takes it, so wrap the environment in gymnasium.wrappers.TransformAction, with "
+        "a Discrete space that numbers the combinations or a Box"
+    )
+
+
+def _check_box(algorithm: str, space: spaces.Box) -> None:
+    needs = f"{algorithm} needs an `env` whose actions"
+    if not np.issubdtype(space.dtype, np.floating):
+        raise ValueError(
+            f"{needs} are floating-point numbers, but this one's action space is {space}: what it executes would be "
+            "cut down to whole numbers unnoticed, so make its dtype np.float32 and round inside the environment."
+        )
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        raise ValueError(
+            f"{needs} are bounded, but this one's action space is {space}: wrap it in "
+            "gymnasium.wrappers.RescaleAction or set finite bounds."
+        )
+    if not (space.low < space.high).all():
+        raise ValueError(
+            f"{needs} can vary, but in this one's action space {space} a lower bound is not below its upper one: leave "
+            "out the dimensions that are fixed."
+        )
+    probes = PROBES.astype(space.dtype).reshape(-1, *[1] * len(space.shape))
+    with np.errstate(over="ignore", invalid="ignore"):
+        # As SB3's policies scale actions, in the precision of the space.
+        actions = space.low + 0.5 * (probes + 1.0) * (space.high - space.low)
+        back = 2.0 * ((actions - space.low) / (space.high - space.low)) - 1.0
+        exact = np.abs(back - probes) <= TOLERANCE
+    if not exact.all():  # what overflows is no number, and no number is within the tolerance
+        raise ValueError(
+            f"{needs} can be scaled to [-1, 1] and back, but the bounds of {space} are too large or too close "
+            f"together for {space.dtype}: let the environment take actions from -1 to 1 and rescale them itself."
+        )
+
+
+def check_observation_space(algorithm: str, space: spaces.Space[Any], key: str = "") -> None:
+    """Refuses observations that SB3 cannot take, or takes for others.
+
+    :param algorithm: its name, for the error message
+    :raise ValueError: with one sentence
+    """
+    where = f"the entry {key!r} of its observation space" if key else "its observation space"
+    if isinstance(space, spaces.Tuple) or (key and isinstance(space, spaces.Dict)):
+        raise ValueError(
+            f"{algorithm} needs an `env` with observations that are arrays or a flat Dict of them, but {where} is "
+            f"{space}: wrap it in gymnasium.wrappers.FlattenObservation."
+        )
+    if isinstance(space, spaces.Dict):
+        for name, entry in space.spaces.items():
+            check_observation_space(algorithm, entry, name)
+    elif np.any(getattr(space, "start", 0)):
+        raise ValueError(
+            f"{algorithm} needs observations that count from 0, as SB3 encodes them one-hot, but {where} is {space}: "
+            "subtract `start` in gymnasium.wrappers.TransformObservation."
+        )

@@ -9,6 +9,8 @@ from gymnasium import spaces
 
 #: Scaled actions that must come back unchanged, and by how much at most they may differ.
 PROBES, TOLERANCE = np.linspace(-1, 1, 9), 1e-3
+#: Observations, and entries of a ``Dict`` of them, for which SB3 has networks.
+OBSERVATIONS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool | None) -> None:
@@ -18,7 +20,7 @@ def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool 
     :param discrete: whether it needs a ``Discrete`` space, or a ``Box``; None: it takes either
     :raise ValueError: with one sentence
     """
-    kinds = {True: "finite (Discrete)", False: "continuous (Box)", None: "Box or Discrete"}
+    kinds = {True: "finite (Discrete)", False: "continuous (Box)", None: "bounded Box or a Discrete"}
     wanted = {True: (spaces.Discrete,), False: (spaces.Box,), None: (spaces.Box, spaces.Discrete)}
     if not isinstance(space, wanted[discrete]):
         raise ValueError(
@@ -84,16 +86,17 @@ def check_observation_space(algorithm: str, space: spaces.Space[Any], key: str =
     :raise ValueError: with one sentence
     """
     where = f"the entry {key!r} of its observation space" if key else "its observation space"
-    if isinstance(space, spaces.Tuple) or (key and isinstance(space, spaces.Dict)):
-        raise ValueError(
-            f"{algorithm} needs an `env` with observations that are arrays or a flat Dict of them, but {where} is "
-            f"{space}: wrap it in gymnasium.wrappers.FlattenObservation."
-        )
-    if isinstance(space, spaces.Dict):
+    if isinstance(space, spaces.Dict) and not key:
         for name, entry in space.spaces.items():
             check_observation_space(algorithm, entry, name)
+    elif not isinstance(space, OBSERVATIONS) or np.ndim(getattr(space, "nvec", 0)) > 1:
+        raise ValueError(
+            f"{algorithm} needs an `env` with observations that SB3 takes (Box, Discrete, one-dimensional "
+            f"MultiDiscrete, MultiBinary, or a Dict of them), but {where} is {space}: wrap it in "
+            "gymnasium.wrappers.FlattenObservation."
+        )
     elif np.any(getattr(space, "start", 0)):
         raise ValueError(
-            f"{algorithm} needs observations that count from 0, as SB3 encodes them one-hot, but {where} is {space}: "
-            "subtract `start` in gymnasium.wrappers.TransformObservation."
+            f"{algorithm} needs an `env` whose observations count from 0, as SB3 encodes them one-hot, but {where} is "
+            f"{space}: subtract `start` in gymnasium.wrappers.TransformObservation."
         )

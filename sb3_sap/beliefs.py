@@ -93,8 +93,8 @@ def plot_permissibility(
     if axis is None:
         axis = Figure(figsize=(6, 4.4), layout="constrained").subplots()
     image = draw_beliefs(axis, model, values, rows.get("", rows), action)
-    axis.set(xlabel=variable_name or f"observation {f'{key}[{index}]' if key else index}")
-    axis.set(ylabel=action_name or ("action" if n_actions == 1 else f"action {action}"))
+    axis.set(xlabel=variable_name or f"{key or 'observation'}[{index}]")
+    axis.set(ylabel=action_name or ("action" if n_actions == 1 else f"action[{action}]"))
     if invented:
         axis.set_title("the other variables are held at 0, in a state that may not occur", fontsize="small")
     figure = axis.get_figure(root=True)

@@ -47,19 +47,34 @@ def load_config(algo: str) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def preset_names(algo: str = "ddpg_ap") -> list[str]:
-    """The presets of an algorithm: the entries that are no environments, the constructor's own settings among them."""
-    return [name for name in load_config(algo) if not _ENVIRONMENT.search(name) and not name.endswith("-3k")]
+def preset_names(algo: str | type) -> list[str]:
+    """The presets of an algorithm: the entries that are no environments, the constructor's own settings among them.
+
+    :param algo: the algorithm, a class of this package or its RL Zoo name
+    """
+    entries = load_config(_zoo_name(algo))
+    return [name for name in entries if not _ENVIRONMENT.search(name) and not name.endswith("-3k")]
 
 
-def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[str, Any]:
-    """Constructor arguments: ``DDPGAP("MlpPolicy", env, **preset("paper"))``.
+def preset(name: str, algo: str | type | None = None, steps: int | None = None) -> dict[str, Any]:
+    """Constructor arguments: ``TQCAP("MlpPolicy", env, **preset("fast", TQCAP))``.
 
     :param name: ``"paper"``, the values of section 5.1; ``"fast"``, what learns lane keeping soonest; ``"tuned"``, a
-        peer's best; or ``"default"``, the constructor's own
-    :param algo: the algorithm, by its RL Zoo name
+        peer's best on lane keeping; or ``"default"``, the constructor's own
+    :param algo: the algorithm, a class of this package, one derived from it, or its RL Zoo name; ``None`` for the
+        paper's preset alone, which is DDPG-AP's
     :param steps: planned length of the training; None: the preset's own
+    :raise ValueError: for an unknown preset or algorithm, or none
     """
+    if algo is None:
+        if name != "paper":
+            _check("name", name, list(dict.fromkeys(known for each in algorithms() for known in preset_names(each))))
+            raise ValueError(
+                f"The preset {name!r} differs from algorithm to algorithm: name yours, as in preset({name!r}, TQCAP) "
+                f"or preset({name!r}, 'tqc_ap')."
+            )
+        algo = "ddpg_ap"
+    algo = _zoo_name(algo)
     _check("name", name, preset_names(algo))
     entries = load_config(algo)
     short = f"{name}-3k"
@@ -70,6 +85,22 @@ def preset(name: str, algo: str = "ddpg_ap", steps: int | None = None) -> dict[s
 def settings_in(entry: dict[str, Any]) -> dict[str, Any]:
     """The constructor arguments among an entry's keys."""
     return {key: value for key, value in entry.items() if key not in RUNNER_KEYS}
+
+
+def _zoo_name(algo: str | type) -> str:
+    """The RL Zoo name of an algorithm; a class derived from one of this package's has that one's."""
+    if not isinstance(algo, type):
+        return algo
+    from sb3_sap.algorithms import ALGORITHMS  # here, so that commands read presets without loading every algorithm
+
+    names = {known: name for name, known in ALGORITHMS.items()}
+    for ancestor in algo.__mro__:
+        if ancestor in names:
+            return names[ancestor]
+    raise ValueError(
+        f"`algo` = {algo.__name__} is neither an algorithm of sb3_sap nor derived from one: pass such a class, or one "
+        f"of the names {', '.join(map(repr, algorithms()))}."
+    )
 
 
 def _check(argument: str, value: str, known: list[str]) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import set_random_seed
 from torch.nn import functional as F
 from toy import DISCRETE, GUIDED, Line, build
@@ -219,3 +220,35 @@ def test_values_are_taught_while_learning_and_zero_changes_no_bit():
     assert same(weights(plain.policy), weights(zero.policy))
     assert not same(weights(plain.policy), weights(some.policy))
     assert action_values(some, th.zeros(5, 2)).shape == (5, 3)
+
+
+class Frozen(FlattenExtractor):
+    """Begins with a layer that is not trained."""
+
+    def __init__(self, space):
+        super().__init__(space)
+        self.layer = th.nn.Linear(2, 2).requires_grad_(False)
+
+    def forward(self, observations):
+        return self.layer(super().forward(observations))
+
+
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP, CrossQAP, *DISCRETE])
+def test_frozen_layers_stay_as_they_are_and_the_others_learn(algorithm):
+    policy_kwargs = {"net_arch": [8], "features_extractor_class": Frozen}
+    model = build(algorithm, policy_kwargs=policy_kwargs, actor_permissibility_coef=1.0)
+    before = weights(model.policy)
+    model.validation_accuracy = 1.0
+    model.learn(60)
+    after = weights(model.policy)
+    changed = {name for name, value in before.items() if not th.equal(value, after[name])}
+    assert changed
+    assert not [name for name in changed if "extractor" in name]
+
+
+def test_an_actor_that_is_frozen_altogether_stays_as_it_is():
+    model = build(DDPGAP).learn(30)
+    model.actor.requires_grad_(False)
+    before = weights(model.actor)
+    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    assert same(before, weights(model.actor))

@@ -4,10 +4,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import Line, build, towards_centre
 
-from sb3_sap import DQNAP, ActionPermissibility, check_permissibility
-from sb3_sap.check import N_ACTIONS
+from sb3_sap import DQNAP, ActionPermissibility, check_permissibility, quick_classifier
+from sb3_sap.trials import N_ACTIONS
+
+
+@pytest.fixture(autouse=True)
+def fewer_fits(monkeypatch):
+    """The classifiers of these problems need no more."""
+    monkeypatch.setattr(quick_classifier, "FITS", 40)
 
 
 class FixedLine(Line):
@@ -81,10 +89,55 @@ def test_labels_by_info_and_by_function_agree(kind):
 
 def test_units_and_several_dimensions():
     report = check(FixedLine(0.5, dim=3, low=-20.0, high=60.0), n_steps=2_000)
-    # x' = x + 0.1 · mean: along one dimension a threshold, where the two others leave it any say.
+    # x' = x + 0.1 · mean: along one dimension a threshold, where the two others leave it any say; together they decide.
     assert report.label_changes == 1
-    assert 0 < report.action_matters < 1
+    assert report.action_matters == 1
     assert report.accuracy > 0.9
+    # Each has the same say.
+    assert report.action_informs == pytest.approx([report.action_informs[0]] * 3, abs=0.08)
+    assert min(report.action_informs) > 0.05
+
+
+def test_what_six_joints_decide_together():
+    """The label is a weighted sum, which one dimension seldom turns over when the others are far from the balance."""
+    weights = np.ones(6)
+    report = check(FixedLine(0.5, dim=6), lambda obs, actions, next_obs: actions @ weights > 0)
+    assert report.action_matters == 1
+    report = check(FixedLine(0.5, dim=6), lambda obs, actions, next_obs: (actions @ weights > 0) & (obs[:, 0] < 0))
+    assert report.action_matters == 0
+
+
+def test_dimensions_that_say_nothing_are_named():
+    report = check(FixedLine(0.5, dim=3), lambda obs, actions, next_obs: actions[:, 1] > 0, n_steps=1_000)
+    first, second, third = report.action_informs
+    assert second == pytest.approx(0.5, abs=0.08)  # shuffled, it is as good as a coin
+    assert max(first, third) < 0.02
+    assert "action[1] 4" in str(report) or "action[1] 5" in str(report)
+    assert any("from action[0] and action[2]." in sentence for sentence in report.advice)
+
+
+def test_a_classifier_that_does_not_see_the_action():
+    decided_by_action = check(FixedLine(0.5), steps_left, n_steps=1_000)
+    assert decided_by_action.accuracy_without_action == pytest.approx(0.5, abs=0.08)
+    decided_by_state = check(Line(dim=2), lambda obs, actions, next_obs: obs[:, 1] < 0.45)
+    assert decided_by_state.accuracy_without_action == pytest.approx(decided_by_state.accuracy, abs=0.02)
+    assert len(decided_by_state.advice) == 1
+
+
+def test_the_steps_that_come_back_to_states_are_as_many_as_told(monkeypatch):
+    monkeypatch.setattr(quick_classifier, "FITS", 1)
+
+    def steps(kind, function, **kwargs):
+        env = kind(**kwargs)
+        check(env, function, n_steps=100)
+        return len(env.executed) - 100
+
+    line = {"horizon": 100}
+    assert steps(Line, steps_left, **line) == pytest.approx(3_500, rel=0.25)
+    assert steps(Line, lambda o, a, n: a == 0, n_actions=5, **line) == pytest.approx(5 * 170, rel=0.25)
+    never = steps(Line, lambda o, a, n: o[:, 1] < 0.05, dim=2, **line)
+    assert never == pytest.approx(21_000, rel=0.25)
+    assert steps(Line, lambda o, a, n: a.sum(axis=1) > 0, dim=2, **line) == pytest.approx(5_000, rel=0.25)
 
 
 def test_constant_labels():
@@ -158,6 +211,73 @@ def test_the_report_is_printed(capsys):
     assert "Nothing speaks against" in str(report)
 
 
+class Seen(gym.Env):
+    """Any observations, told at random; permissible is a step to the left."""
+
+    def __init__(self, observation_space):
+        self.observation_space, self.action_space = observation_space, BOX
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {"permissible": bool(action[0] <= 0)}
+
+
+BOX = spaces.Box(-1, 1, (1,))
+PICTURES = [spaces.Box(0, 255, shape, np.uint8) for shape in ((36, 36, 3), (3, 20, 30), (5, 4, 1))]
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        *(spaces.Dict(picture=picture, speed=BOX) for picture in PICTURES),
+        spaces.Dict(gear=spaces.Discrete(3), doors=spaces.MultiBinary(4), knobs=spaces.MultiDiscrete([2, 3])),
+        spaces.Discrete(3),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(4),
+        spaces.MultiBinary([2, 3]),
+        PICTURES[1],
+    ],
+    ids=str,
+)
+def test_observations_that_sb3_takes(space, monkeypatch):
+    monkeypatch.setattr(quick_classifier, "FITS", 3)
+    shapes = []
+
+    def steps_left(obs, actions, next_obs):
+        shapes.append({key: rows.shape[1:] for key, rows in obs.items()} if isinstance(obs, dict) else obs.shape[1:])
+        return actions[:, 0] <= 0
+
+    report = check(Seen(space), steps_left, n_steps=200)
+    assert report.action_matters == 1
+    assert report.accuracy is not None
+    # The layout is the environment's own.
+    assert shapes[0] == ({key: s.shape for key, s in space.spaces.items()} if space.shape is None else space.shape)
+
+
+def with_spaces(**changes):
+    env = Line()
+    vars(env).update(changes)
+    return env
+
+
+class Answers(Line):
+    """An environment of another interface."""
+
+    def __init__(self, **answers):
+        super().__init__()
+        self.answers = answers
+
+    def reset(self, **kwargs):
+        return self.answers.get("reset") if "reset" in self.answers else super().reset(**kwargs)
+
+    def step(self, action):
+        return self.answers.get("step") or super().step(action)
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "sentence"),
     [
@@ -165,12 +285,30 @@ def test_the_report_is_printed(capsys):
         ({"n_steps": 10}, ValueError, "at least 100"),
         ({"env": Line(labels=False)}, ValueError, "There is no AP function"),
         ({"policy": 3}, TypeError, "SB3's `predict`"),
-        ({"env": Line(low=-np.inf, high=np.inf)}, ValueError, "bounded"),
-        (
-            {"env": gym.make("Blackjack-v1").unwrapped, "ap_function": "nowhere.nothing"},
-            ValueError,
-            "cannot be imported",
+        *(
+            ({"env": with_spaces(action_space=space)}, ValueError, "a bounded Box or a Discrete action space, but")
+            for space in (spaces.MultiDiscrete([2, 2]), spaces.MultiBinary(2), spaces.Dict(a=BOX), spaces.Tuple([BOX]))
         ),
+        ({"env": with_spaces(action_space=spaces.Box(-np.inf, np.inf, (1,)))}, ValueError, "actions are bounded"),
+        ({"env": with_spaces(observation_space=spaces.Discrete(3, start=1))}, ValueError, "subtract `start`"),
+        *(
+            ({"env": with_spaces(observation_space=space)}, ValueError, "(?s)observations that SB3 takes.*Flatten")
+            for space in (
+                spaces.Tuple([BOX]),
+                spaces.Dict(a=spaces.Dict(b=BOX)),
+                spaces.Dict(a=spaces.Tuple([BOX])),
+                spaces.Text(3),
+                spaces.MultiDiscrete([[2, 3], [2, 3]]),
+            )
+        ),
+        ({"env": DummyVecEnv([Line])}, TypeError, "single Gymnasium environment"),
+        ({"env": "CartPole-v1"}, TypeError, "single Gymnasium environment"),
+        ({"env": Answers(reset=0)}, ValueError, r"`env.reset` must return .* returned one int"),
+        ({"env": Answers(reset=(0, 0, {}))}, ValueError, r"`env.reset` must .* a tuple of \(int, int, dict\)"),
+        ({"env": Answers(step=(0, 0.0, True, {}))}, ValueError, r"`env.step` must .* \(int, float, bool, dict\)"),
+        ({"ap_function": lambda obs, actions: actions > 0}, RuntimeError, r"with batches \(obs, actions, next_obs\)"),
+        ({"ap_function": lambda a, b, c, d: b > 0}, RuntimeError, r"with batches \(obs, actions, next_obs\)"),
+        ({"ap_function": "nowhere.nothing"}, ValueError, "cannot be imported"),
     ],
 )
 def test_what_cannot_be_checked_is_told(arguments, error, sentence):
@@ -185,7 +323,8 @@ def energy_did_not_fall(obs, actions, next_obs):
     return energy(next_obs) >= energy(obs)
 
 
-def test_mountain_car():
+def test_mountain_car(monkeypatch):
+    monkeypatch.setattr(quick_classifier, "FITS", 120)
     env = gym.make("MountainCarContinuous-v0")
     with_velocity, against = (
         check(env, energy_did_not_fall, policy=lambda obs, sign=sign: sign * np.sign(obs[1:])) for sign in (1, -1)

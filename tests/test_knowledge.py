@@ -1,3 +1,4 @@
+import pickle
 from collections import Counter
 
 import numpy as np
@@ -233,3 +234,42 @@ def test_an_unbalanced_sample_follows_the_labels():
     assert sample.labels.sum() == pytest.approx(500, abs=80)  # 4 standard deviations
     np.testing.assert_array_equal(sample.actions[:, 0], sample.labels)  # each action beside its own label
     assert knowledge.sample(2000).labels.sum() == 1000
+
+
+def circle(n):
+    angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+
+
+def test_a_typical_observation_is_one_that_was_seen():
+    k = KnowledgeBuffer(spaces.Box(-1, 1, (2,)), 1, 3_000, seed=0)
+    assert k.typical_observation() is None
+    k.add(circle(100), np.zeros((100, 1)), np.arange(100) % 2 == 0)
+    assert np.linalg.norm(k.typical_observation()) == pytest.approx(1)  # the median is (0, 0)
+    skewed = np.array([[0.0, 0.1]] * 30 + [[1.0, 1.0]], np.float32)
+    k = KnowledgeBuffer(spaces.Box(-1, 1, (2,)), 1, 3_000, seed=0)
+    k.add(skewed, np.zeros((31, 1)), np.ones(31, bool))
+    np.testing.assert_array_equal(k.typical_observation(), np.float32([0.0, 0.1]))
+
+
+@pytest.mark.parametrize("n", [0, 3, 40, 200])
+def test_pickling_writes_only_what_is_filled(n):
+    images = spaces.Box(0, 255, (20, 20, 3), np.uint8)
+    k = KnowledgeBuffer(spaces.Dict(image=images, v=spaces.Box(-1, 1, (1,))), 1, 100, seed=0)
+    rng = np.random.default_rng(0)
+    obs = {"image": rng.integers(0, 256, (n, 20, 20, 3), np.uint8), "v": rng.random((n, 1))}
+    k.add(obs, rng.random((n, 1)), rng.random(n) < 0.5)
+    written = pickle.dumps(k)
+    assert len(written) < 6_000 + 1_300 * len(k)
+    restored = pickle.loads(written)
+    for key, store in k.observations.items():
+        np.testing.assert_array_equal(restored.observations[key], store)
+        assert restored.observations[key].dtype == store.dtype
+    np.testing.assert_array_equal(restored.actions, k.actions)
+    assert restored.counts("train") == k.counts("train")
+    # and both go on alike
+    more = {"image": rng.integers(0, 256, (30, 20, 20, 3), np.uint8), "v": rng.random((30, 1))}
+    actions, labels = rng.random((30, 1)), rng.random(30) < 0.5
+    for one in (k, restored):
+        one.add(more, actions, labels)
+    np.testing.assert_array_equal(restored.observations["image"], k.observations["image"])

@@ -16,7 +16,7 @@ FLOORS = (
     {"demo", "hub"},
     {"zoo", "benchmark", "evaluation", "plots", "beliefs", "presets", "statistics"},
     {"algorithms"},
-    {"exploration", "check"},
+    {"exploration", "check", "trials", "quick_classifier"},
     {"learning"},
     {
         "constraints",

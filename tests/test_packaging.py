@@ -24,7 +24,7 @@ PROGRAMS = {
         from sb3_sap.presets import algorithms, preset
 
         env = gym.make("sap/LaneKeeping-v0", track="eroad")
-        sb3_sap.DDPGAP("MlpPolicy", env, **preset("fast")).learn(120, progress_bar=True)
+        sb3_sap.DDPGAP("MlpPolicy", env, **preset("fast", sb3_sap.DDPGAP)).learn(120, progress_bar=True)
         assert all(isinstance(preset("default", algo), dict) for algo in algorithms())
         assert main(["benchmark", "report"]) == 1  # a sentence says which extra is needed
     """,

@@ -77,7 +77,16 @@ def test_a_key_of_a_dictionary():
     held = {"x": np.zeros(1, np.float32), "time": np.full(1, 3.0, np.float32)}
     figure = plot_permissibility(model, ("x", 0), obs=held, limits=(-1, 1))
     assert mesh(figure)[0][0, [0, -1]] == pytest.approx(sigmoid([3 - 2, 3 + 2]))
-    assert figure.axes[0].get_xlabel() == "observation x[0]"
+    assert figure.axes[0].get_xlabel() == "x[0]"
+
+
+def test_axes_are_named_as_in_code():
+    axis = plot_permissibility(linear_model([0.0] * 4, env=Line(dim=2)), 1, action=1).axes[0]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("observation[1]", "action[1]")
+    axis = plot_permissibility(linear_model([0.0] * 3)).axes[0]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("observation[0]", "action")
+    goal = linear_model([0.0] * 5, env=Line("goal"), policy="MultiInputPolicy")
+    assert plot_permissibility(goal, ("observation", 1)).axes[0].get_xlabel() == "observation[1]"
 
 
 def test_finite_actions():
@@ -97,8 +106,15 @@ def test_what_k_holds_gives_limits_and_the_state_that_is_held():
 
 
 def test_after_load_there_is_no_k(tmp_path):
-    build(DDPGAP).learn(100).save(tmp_path / "model")
-    _, values, _ = mesh(plot_permissibility(DDPGAP.load(tmp_path / "model")))
+    model = build(DDPGAP).learn(100)
+    model.save(tmp_path / "model")
+    loaded = DDPGAP.load(tmp_path / "model")
+    figure = plot_permissibility(loaded)
+    _, values, _ = mesh(figure)
+    seen = model.replay_buffer.knowledge.observations[""]
+    assert (loaded.typical_observation == seen).all(axis=1).any()  # a state that occurred is held, as before the saving
+    np.testing.assert_array_equal(loaded.typical_observation, model.replay_buffer.knowledge.typical_observation())
+    assert figure.axes[0].get_title() == ""
     assert (values[0], values[-1]) == (-1, 1)
 
 

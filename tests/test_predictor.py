@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from torch import nn
 
 from sb3_sap import PermissibilityPredictor
@@ -147,3 +147,53 @@ def test_a_saved_state_knows_that_it_was_fitted():
     assert not fresh.fitted
     fresh.load_state_dict(e.state_dict())
     assert fresh.fitted
+
+
+class Normalising(BaseFeaturesExtractor):
+    """Its layers do one thing while training and another afterwards."""
+
+    def __init__(self, space, layer):
+        super().__init__(space, 2)
+        self.layer = {"batch norm": nn.BatchNorm1d(2, momentum=1.0), "dropout": nn.Dropout(0.5)}[layer]
+
+    def forward(self, observations):
+        return self.layer(observations)
+
+
+def with_layer(layer, **settings):
+    return predictor(
+        net_arch=[8],
+        features_extractor_class=Normalising,
+        features_extractor_kwargs={"layer": layer},
+        **settings,
+    )
+
+
+EXAMPLES = dataset([[10, 1], [12, 3], [14, 5], [16, 7], [18, 9]], np.zeros((5, 1)), [0, 1, 0, 1, 0])
+
+
+def test_batch_norm_takes_statistics_from_fits_alone():
+    e = with_layer("batch norm", batch_size=4, learning_rate=0.0)
+    e.fit(EXAMPLES)  # in one batch: the last row has no variance of its own
+    mean = th.tensor([14.0, 5.0])
+    th.testing.assert_close(e.features_extractor.layer.running_mean, mean)
+    for rows in (EXAMPLES, LabelledActions(*(part[:2] for part in EXAMPLES))):
+        e.recall(rows)
+    one = e.features(th.tensor([[14.0, 5.0]]))
+    th.testing.assert_close(one, th.zeros(1, 2))
+    th.testing.assert_close(e.features_extractor.layer.running_mean, mean)
+    assert not e.training
+
+
+def test_dropout_is_drawn_in_fits_alone_and_from_no_global_generator():
+    before = th.get_rng_state()
+    e, same = with_layer("dropout"), with_layer("dropout")
+    assert e.fit(EXAMPLES) == same.fit(EXAMPLES)
+    assert e.fit(EXAMPLES) == same.fit(EXAMPLES)
+    obs, actions = th.tensor(EXAMPLES.observations), th.tensor(EXAMPLES.actions)
+    th.testing.assert_close(e(obs, actions), e(obs, actions), rtol=0, atol=0)
+    assert th.equal(th.get_rng_state(), before)
+    losses = {e.loss(obs, actions, th.tensor(EXAMPLES.labels)).item() for _ in range(2)}
+    with e._training():
+        losses.add(e.loss(obs, actions, th.tensor(EXAMPLES.labels)).item())
+    assert len(losses) == 2

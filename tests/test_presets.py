@@ -4,9 +4,10 @@ from importlib import resources
 
 import gymnasium as gym
 import pytest
+from stable_baselines3 import SAC
 from toy import DISCRETE
 
-from sb3_sap import DDPGAP
+from sb3_sap import DDPGAP, SACAP, TQCAP
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.learners import CLASSES
 from sb3_sap.presets import algorithms, load_config, preset, preset_names
@@ -67,6 +68,20 @@ def test_preset_as_typed():
     assert model.critic.optimizer.param_groups[0]["lr"] == 0.001
 
 
+@pytest.mark.parametrize(("algo", "cls"), ALGORITHMS.items())
+def test_a_class_stands_for_its_name(algo, cls):
+    derived = type("Mine", (cls,), {})
+    for name in preset_names(algo):
+        assert preset(name, cls) == preset(name, derived) == preset(name, algo)
+    assert preset_names(derived) == preset_names(algo)
+
+
+def test_fast_is_another_for_each_algorithm():
+    assert preset("fast", TQCAP)["gamma"] == 0.8
+    assert preset("fast", SACAP)["gamma"] == 0.9
+    assert TQCAP("MlpPolicy", gym.make("sap/LaneKeeping-v0"), **preset("fast", TQCAP)).gamma == 0.8
+
+
 def test_every_algorithm_has_a_config_that_is_installed():
     assert set(ALGORITHMS) <= set(algorithms()) <= set(CLASSES)
     for algo in ALGORITHMS:
@@ -81,7 +96,13 @@ def test_every_algorithm_has_a_config_that_is_installed():
     [
         (("papper",), "did you mean 'paper'"),
         (("paper", "ddpg_pa"), "did you mean 'ddpg_ap'"),
-        (("x",), "one of 'paper', 'default'"),
+        (("x", "ddpg_ap"), "one of 'paper', 'default'"),
+        (("fats",), "did you mean 'fast'"),
+        (("fast",), r"preset\('fast', TQCAP\) or preset\('fast', 'tqc_ap'\)"),
+        (("default",), "differs from algorithm to algorithm"),
+        (("paper", TQCAP), "`name` = 'paper' is unknown: choose one of 'default', 'fast'"),
+        (("fast", SAC), "`algo` = SAC is neither an algorithm of sb3_sap nor derived from one.*'tqc_ap'"),
+        (("fast", dict), "`algo` = dict is neither"),
     ],
 )
 def test_unknown_names(arguments, message):

@@ -1,4 +1,5 @@
 import json
+import threading
 import zipfile
 
 import numpy as np
@@ -254,3 +255,74 @@ def test_a_truncated_file_gives_one_clear_error(algorithm, tmp_path):
             algorithm.load(path)
     path.write_bytes(whole)
     algorithm.load(path)
+
+
+def test_load_applies_new_settings_of_the_predictors_optimizer(tmp_path):
+    model = build(DDPGAP).learn(60)
+    model.save(tmp_path / "model")
+    settings = {"net_arch": [8], "batch_size": 4, "learning_rate": 1e-5, "weight_decay": 0.0}
+    extra = {"optimizer_kwargs": {"betas": (0.5, 0.9)}}
+    loaded = DDPGAP.load(tmp_path / "model", env=Line(), predictor_kwargs={**settings, **extra})
+    [group] = loaded.predictor.optimizer.param_groups
+    assert (group["lr"], group["weight_decay"], group["betas"]) == (1e-5, 0.0, (0.5, 0.9))
+    assert loaded.predictor.batch_size == 4
+    # The weights and running averages are those of the file.
+    saved, own = (flat(m.predictor.optimizer.state_dict()["state"]) for m in (model, loaded))
+    assert saved.keys() == own.keys() != set()
+    for name, value in saved.items():
+        np.testing.assert_array_equal(value, own[name])
+    loaded.learn(30)
+
+
+@pytest.mark.parametrize(
+    ("changed", "names"),
+    [
+        ({"optimizer_class": "SGD"}, "optimizer_class"),
+        ({"optimizer_class": th.optim.AdamW}, "optimizer_class"),
+        ({"activation_fn": th.nn.Tanh}, "activation_fn"),
+        ({"net_arch": [9], "activation_fn": th.nn.Tanh}, "net_arch, activation_fn"),
+        ({"features_extractor_class": "sb3_sap.RescaleExtractor"}, "features_extractor_class"),
+    ],
+    ids=str,
+)
+def test_load_refuses_another_predictor(tmp_path, changed, names):
+    build(DDPGAP).learn(30).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=f"^`predictor_kwargs` change {names} of a saved.*build a new DDPGAP"):
+        DDPGAP.load(tmp_path / "model", predictor_kwargs={"net_arch": [8], "batch_size": 16, **changed})
+
+
+def test_set_parameters_keeps_the_models_own_settings_and_refuses_another_optimizer(tmp_path):
+    build(DDPGAP).learn(60).save(tmp_path / "model")
+    other = build(DDPGAP, predictor_kwargs={"net_arch": [8], "learning_rate": 1e-5})
+    other.set_parameters(tmp_path / "model")
+    assert other.predictor.optimizer.param_groups[0]["lr"] == 1e-5
+    with pytest.raises(TypeError, match="another optimizer than the predictor's SGD"):
+        build(DDPGAP, predictor_kwargs={"net_arch": [8], "optimizer_class": "SGD"}).set_parameters(tmp_path / "model")
+
+
+def test_load_heeds_a_new_seed(tmp_path):
+    build(DDPGAP).learn(60).save(tmp_path / "model")
+
+    def draws(**settings):
+        model = DDPGAP.load(tmp_path / "model", **settings)
+        return model._rng.random(), model.replay_buffer.knowledge.rng.random()
+
+    assert draws(seed=5) == draws(seed=5) != draws(seed=6)
+    assert draws()[0] == draws()[0]  # goes on where the saved one was
+
+
+@pytest.mark.parametrize("name", ["ap_function", "permissible_actions", "constraint"])
+def test_a_function_that_cannot_be_pickled_is_told_at_construction_and_costs_no_checkpoint(tmp_path, name):
+    lock = threading.Lock()
+    functions = {
+        "ap_function": lambda obs, actions, next_obs: lock and towards_centre(obs, actions, next_obs),
+        "permissible_actions": lambda obs, actions: np.ones(len(actions), bool) if lock else None,
+        "constraint": lambda obs, previous, action: nearby(obs, previous, action) if lock else None,
+    }
+    with pytest.warns(UserWarning, match=rf"^`{name}` .* cannot be pickled.*`load\(path, {name}=...\)`"):
+        model = build(DDPGAP, **{name: functions[name]}).learn(20)
+    model.save(tmp_path / "model")
+    assert getattr(DDPGAP.load(tmp_path / "model"), name) is None
+    with pytest.warns(UserWarning, match="cannot be pickled"):
+        loaded = DDPGAP.load(tmp_path / "model", env=Line(), **{name: functions[name]})
+    assert getattr(loaded.learn(20), name) is functions[name]

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from sb3_contrib import QRDQN
+from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import GUIDED, Line, build
 
-from sb3_sap import DDPG, DDPGAP, DQNAP, SACAP
+from sb3_sap import DDPG, DDPGAP, DQNAP, QRDQNAP, SACAP, ConstrainedExplorationMixin
 
 
 def only_right(obs, actions):
@@ -109,3 +111,40 @@ def test_saved_by_name_and_resolved_again(tmp_path):
 def test_a_rule_that_does_not_answer(algorithm, rule, error, message):
     with pytest.raises(error, match=message):
         build(algorithm, permissible_actions=rule).learn(30)
+
+
+def rightmost(obs, actions):
+    return actions.reshape(len(actions)) == 2
+
+
+class RuledDQN(ConstrainedExplorationMixin, DQN):
+    pass
+
+
+class RuledQRDQN(ConstrainedExplorationMixin, QRDQN):
+    pass
+
+
+class RuledSAC(ConstrainedExplorationMixin, SAC):
+    pass
+
+
+@pytest.mark.parametrize("algorithm", [DQNAP, QRDQNAP, RuledDQN, RuledQRDQN])
+def test_a_rule_alone_needs_no_labels_for_finite_actions(algorithm):
+    env = Line(n_actions=3, labels=False)
+    model = build(algorithm, env, permissible_actions=rightmost).learn(60)
+    assert set(map(int, env.executed)) == {2}
+    if algorithm in (DQNAP, QRDQNAP):
+        assert not model.predictor.fitted
+
+
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP, RuledSAC])
+def test_nor_for_continuous_ones(algorithm):
+    env = Line(labels=False)
+    build(algorithm, env, permissible_actions=only_right).learn(60)
+    assert (np.array(env.executed) > 0.5).all()
+
+
+def test_labels_beside_a_rule_are_learned_from():
+    model = build(DQNAP, permissible_actions=lambda obs, actions: np.ones(len(actions), bool)).learn(60)
+    assert sum(model.replay_buffer.knowledge.seen) == 60

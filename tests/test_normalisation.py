@@ -88,7 +88,7 @@ def test_of_several_runs_one_has_to_be_named(tmp_path):
         (tmp_path / run).mkdir()
         for name in ("config.yml", "vecnormalize.pkl"):
             (tmp_path / run / name).touch()
-    with pytest.raises(ValueError, match="A-v0/vecnormalize.pkl or .*name one with `--vecnormalize`"):
+    with pytest.raises(ValueError, match=r"A-v0/vecnormalize.pkl or .*name one with `--vecnormalize`"):
         find_statistics(tmp_path / "best_model.zip")
     assert find_statistics(tmp_path / "A-v0.zip") == tmp_path / "A-v0" / "vecnormalize.pkl"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -23,10 +24,17 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     # Networks this small run no faster on two threads, and one thread always adds in the same order.
     th.set_num_threads(1)
+    _find_modules_of_current_folder()
     if arguments and arguments[0] in zoo.COMMANDS:
         return zoo.main(arguments)  # RL Zoo reads its flags itself
     options = parser().parse_args(arguments)
     return run_command(lambda: int(options.run(options, Console())))
+
+
+def _find_modules_of_current_folder() -> None:
+    """Has environments and functions of a user's own found as by ``python -m``, but after what is installed."""
+    if not {"", os.getcwd()} & set(sys.path):
+        sys.path.append(os.getcwd())
 
 
 def parser() -> argparse.ArgumentParser:

@@ -3,6 +3,7 @@
 import io
 import os
 import re
+import sys
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -118,6 +119,21 @@ def test_the_default_entry_serves_other_environments():
     assert CountsEnds.ends == 1  # rl_zoo3 tells the first callback twice
 
 
+def test_modules_of_the_current_folder_are_found(monkeypatch):
+    """As `python -m sb3_sap.zoo` finds them; the console command has its own folder on the path instead."""
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != os.getcwd()])
+    Path("nearby_env.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('Nearby-v0', 'gymnasium.envs.classic_control:PendulumEnv', max_episode_steps=5)\n"
+        "def fine(obs, actions, next_obs):\n    return obs[:, 0] == obs[:, 0]\n"
+    )
+    entry = {"policy": "MlpPolicy", "n_timesteps": 20, "ap_function": "nearby_env.fine"}
+    Path("own.yml").write_text(yaml.safe_dump({"default": entry}))
+    command = ["train", "--gym-packages", "nearby_env", "--env", "Nearby-v0", "-n", "6", "--eval-freq", "-1"]
+    assert main([*command, "--conf-file", "own.yml", "-params", *QUICK]) == 0
+    assert sys.path.count(os.getcwd()) == 1
+
+
 def all_permissible(obs, actions, next_obs):
     return np.ones(len(actions), dtype=bool)
 
@@ -144,6 +160,12 @@ def test_watching_needs_no_buffers(tmp_path):
         (["-params", "alpha:2"], "`alpha` is a probability from 0 to 1, but is 2"),
         (["-params", "learning_rate:'1e-3'"], "write it with a point, 1.0e-3."),
         (["-params", "policy:'MlpPolcy'"], "did you mean 'MlpPolicy'?"),
+        (["-params", "normalize:True", "frame_stack:2"], "ddpg_ap cannot have `normalize` and `frame_stack` together"),
+        (
+            ["--algo", "sac", "-params", "normalize:dict(norm_obs=False)", "frame_stack:3"],
+            "VecFrameStack: {n_stack: 3}}]",
+        ),
+        (["--gym-packages", "json", "my_env"], "`--gym-packages`: 'my_env' cannot be imported (No module named"),
         (["--conf-file", "nowhere.yml"], "There is no configuration file nowhere.yml"),
         (["--trial-id", "0"], "give `--storage` and `--study-name`"),
         (["--validation-tracks", "eroad"], "one of the paper's test tracks"),
@@ -180,6 +202,10 @@ def test_values_that_are_no_python(capsys):
             "default: {policy: MlpPolicy, n_timesteps: 10, t_kk: 5}",
             "the key 't_kk' is unknown to ddpg_ap: did you mean 't_k'?",
         ),
+        (
+            "default: {policy: MlpPolicy, n_timesteps: 10, normalize: '{\"norm_reward\": False}', frame_stack: 2}",
+            "own.yml: ddpg_ap cannot have `normalize` and `frame_stack` together",
+        ),
         ("default: {policy: MlpPolicy, n_timesteps: 10, env_wrapper: gymnasium.Nothing}", "cannot be imported"),
     ],
 )
@@ -187,6 +213,18 @@ def test_what_is_wrong_with_a_yaml_file(text, sentence, capsys):
     Path("own.yml").write_text(text)
     assert main(["train", "--env", ENV, "-n", "10", "--conf-file", "own.yml"]) == 1
     assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings"),
+    [
+        ("ppo", {"normalize": True, "frame_stack": 2}),  # which keeps what it is given
+        ("sac", {"normalize": False, "frame_stack": 2}),
+        ("sac", {"normalize": True, "frame_stack": 1}),
+    ],
+)
+def test_frames_may_be_stacked_where_nothing_is_normalised_below(algo, settings):
+    check_hyperparameters(algo, settings, "own.yml")
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

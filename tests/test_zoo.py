@@ -9,6 +9,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -25,7 +26,9 @@ from sb3_sap.evaluation import ENVIRONMENTS, drive_lap, load_policy  # noqa: E40
 from sb3_sap.exploration import ActionPermissibilityMixin  # noqa: E402
 from sb3_sap.presets import load_config  # noqa: E402
 from sb3_sap.zoo.configs import check_hyperparameters  # noqa: E402
+from sb3_sap.zoo.figures import contour  # noqa: E402
 from sb3_sap.zoo.registration import register, small_buffers  # noqa: E402
+from sb3_sap.zoo.retest import summary  # noqa: E402
 from sb3_sap.zoo.spaces import t_k_range  # noqa: E402
 from sb3_sap.zoo.storages import SeededByTrial, is_surplus, open_storage, without_password  # noqa: E402
 
@@ -359,6 +362,35 @@ def test_a_study_in_memory_leaves_a_report():
     assert {path.name for path in report.iterdir()} == {"report.md", "trials.csv"}
     assert "| 0 |" in (report / "report.md").read_text()
     assert Path("trials/trial_1/evaluations.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("seeds", "cells", "sentence"),
+    [
+        ({"default": 1, "trial 0": 1}, ["| 0.5 |  |", "| 0.75 | +0.25 |"], "One seed: no interval."),
+        ({"default": 2, "trial 0": 1}, ["| 0.5 [0.5, 0.5] |", "| +0.25 |"], "Where there is one seed: no interval."),
+        ({"default": 2, "trial 0": 2}, ["| 0.75 [0.75, 0.75] | +0.25 [+0.25, +0.25] |"], "95 %"),
+    ],
+)
+def test_one_seed_has_no_interval(seeds, cells, sentence):
+    study = optuna.create_study(study_name="study")
+    study.tell(study.ask(), 0.9)
+    scores = {"default": 0.5, "trial 0": 0.75}
+    rows = [
+        {"arm": arm, "seed": seed, "task": "t", "score": scores[arm]} for arm in seeds for seed in range(seeds[arm])
+    ]
+    text = summary(pd.DataFrame(rows), study, ["t"], "sb3-sap retest")
+    assert sentence in text
+    for cell in cells:
+        assert cell in text
+
+
+@pytest.mark.parametrize(("n_trials", "title"), [(1, "only 1 trial,"), (6, "only 6 trials,"), (20, "20 trials, the")])
+def test_a_picture_of_few_trials_says_that_it_is_thin(n_trials, title):
+    study = optuna.create_study(study_name="study", sampler=optuna.samplers.RandomSampler(seed=1))
+    study.optimize(lambda trial: trial.suggest_float("x", 0, 1) + trial.suggest_float("y", 0, 1), n_trials)
+    [axis, *_] = contour(study, "x", "y", "value").axes
+    assert axis.get_title().startswith(f"study: {title}")
 
 
 def test_a_tuned_noise_of_none_is_loaded():

@@ -55,8 +55,8 @@ def _import_environments(package: str) -> None:
         importlib.import_module(package)
     except ImportError as error:
         raise ImportError(
-            f"`--gym-packages`: {package!r} cannot be imported ({error}): name a module of the current folder or of the "
-            "Python path, without .py."
+            f"`--gym-packages`: {package!r} cannot be imported ({error}): name a module of the current folder or of "
+            "the Python path, without .py."
         ) from error
 
 

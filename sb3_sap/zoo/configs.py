@@ -97,8 +97,8 @@ def _check_stacking(algo: str, algorithm: Any, frame_stack: Any, source: str) ->
     if issubclass(algorithm, OffPolicyAlgorithm):
         raise ValueError(
             f"{source}: {algo} cannot have `normalize` and `frame_stack` together, for RL Zoo stacks what is "
-            "normalised already: in place of `frame_stack` stack first, `vec_env_wrapper: [{stable_baselines3.common.vec_env."
-            f"VecFrameStack: {{n_stack: {frame_stack}}}}}]`."
+            "normalised already: in place of `frame_stack` stack first, `vec_env_wrapper: [{"
+            f"stable_baselines3.common.vec_env.VecFrameStack: {{n_stack: {frame_stack}}}}}]`."
         )
 
 

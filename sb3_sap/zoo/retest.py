@@ -28,6 +28,8 @@ class RetestManager(StudyManager):
     def hyperparameters_optimization(self) -> None:
         if not (self.storage and self.study_name):
             raise ValueError("`retest` needs a study: give `--storage` and `--study-name`.")
+        if self.n_jobs != 1:
+            raise ValueError("`retest` trains one model after the other: leave `--n-jobs` out.")
         study = load_study(self.storage, self.study_name)
         check_belongs(study, self.algo, self.env_name.gym_id)
         self._follow(study)

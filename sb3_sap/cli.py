@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from sb3_sap.envs.torcs.cli import add_torcs
 from sb3_sap.errors import positive, run_command
 from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.hub import add_push_to_hub
+from sb3_sap.normalisation import NormalisedPolicy, add_vecnormalize
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -22,10 +24,17 @@ def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     # Networks this small run no faster on two threads, and one thread always adds in the same order.
     th.set_num_threads(1)
+    _find_modules_of_current_folder()
     if arguments and arguments[0] in zoo.COMMANDS:
         return zoo.main(arguments)  # RL Zoo reads its flags itself
     options = parser().parse_args(arguments)
     return run_command(lambda: int(options.run(options, Console())))
+
+
+def _find_modules_of_current_folder() -> None:
+    """Has environments and functions of a user's own found as by ``python -m``, but after what is installed."""
+    if not {"", os.getcwd()} & set(sys.path):
+        sys.path.append(os.getcwd())
 
 
 def parser() -> argparse.ArgumentParser:
@@ -84,12 +93,13 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
         "evaluate",
         help="drive laps with a saved model",
         description="Drives one lap of each track with the saved policy alone, prints a table and writes it as JSON. "
-        "Loading a model file runs code that it contains: load only files that you trust.",
+        "Loading a model file or statistics runs code that they contain: load only files that you trust.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("model", type=Path, help="the .zip file of any SB3 model of the lane-keeping task")
     command.add_argument("--tracks", nargs="+", default=list(TEST_TRACKS), metavar="TRACK", help="tracks to drive")
     command.add_argument("--json", type=Path, help="where to write the results; evaluation.json beside the model")
+    add_vecnormalize(command)
     _add_simulator(command)
     command.set_defaults(run=_evaluate)
 
@@ -98,7 +108,9 @@ def _evaluate(options: argparse.Namespace, console: Console) -> int:
     from sb3_sap.demo import drive_tracks, results_table
     from sb3_sap.evaluation import load_policy, write_results
 
-    policy = load_policy(options.model)
+    policy = load_policy(options.model, options.vecnormalize)
+    if isinstance(policy, NormalisedPolicy):
+        console.print(f"Observations are normalised with {policy.path}.", soft_wrap=True)
     results = drive_tracks(policy, options.tracks, options.simulator, console)
     console.print(results_table(results))
     write_results(options.json or options.model.parent / "evaluation.json", results)

@@ -16,6 +16,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_sap.envs import score
 from sb3_sap.files import atomic_path
+from sb3_sap.normalisation import NormalisedPolicy, with_statistics
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -108,8 +109,12 @@ def write_results(path: Path, results: list[LapResult]) -> None:
         temporary.write_text(json.dumps([asdict(result) for result in results], indent=2) + "\n", encoding="utf-8")
 
 
-def load_policy(path: Path) -> BasePolicy:
-    """Loads the policy alone from a model file, whichever SB3 algorithm saved it."""
+def load_policy(path: Path, vecnormalize: Path | None = None) -> BasePolicy | NormalisedPolicy:
+    """Loads the policy alone from a model file, whichever SB3 algorithm saved it; it takes raw observations.
+
+    :param vecnormalize: statistics of SB3's ``VecNormalize``; without them those that lie beside the model, as RL Zoo
+        and SB3's ``CheckpointCallback`` leave them, if it learned on normalised observations or does not say
+    """
     if not path.is_file():
         raise FileNotFoundError(f"There is no model file {path}: give the .zip that `model.save` or the demo wrote.")
     try:
@@ -123,4 +128,4 @@ def load_policy(path: Path) -> BasePolicy:
     )
     policy.load_state_dict(cast(dict[str, Any], params["policy"]))
     policy.set_training_mode(False)
-    return policy
+    return with_statistics(policy, path, data.get("learned_normalised"), vecnormalize)

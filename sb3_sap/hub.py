@@ -13,47 +13,17 @@ from typing import Any
 
 import yaml
 from rich.console import Console
+from stable_baselines3.common.policies import BasePolicy
 
 from sb3_sap import __version__
+from sb3_sap.card import CARD, USE, USE_NORMALISED, env_arguments
 from sb3_sap.errors import nearest, positive
-from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.evaluation import ENVIRONMENTS, load_policy, make_env
 from sb3_sap.files import atomic_path
+from sb3_sap.normalisation import FILE_NAME, NormalisedPolicy, add_vecnormalize
 
 #: What `sb3-sap demo` leaves besides the model, as far as it goes to the Hub.
 EXTRAS = ("lap.gif", "learning_curve.png", "predictor.png", "evaluation.json", "training.csv")
-CARD = """\
----
-{{{{ card_data }}}}
----
-
-# {algo} on {env_id}
-
-{class_name} of sb3_sap, a Stable-Baselines3 model that learns which actions are
-permissible while it learns to act.{pictures}
-
-## Results
-
-{results}
-
-## Use
-
-A model file holds pickled objects: loading one runs its code. Load only what you trust.
-
-```python
-from huggingface_sb3 import load_from_hub
-from sb3_sap import {class_name}
-
-model = {class_name}.load(load_from_hub("{repo_id}", "{filename}"))
-```
-
-## How it was made
-
-```
-{command}
-```
-
-with sb3_sap {version} and Stable-Baselines3 {sb3_version}.
-"""
 
 
 @dataclass(frozen=True)
@@ -66,14 +36,17 @@ class Trained:
     command: str
     laps: tuple[dict[str, Any], ...] = ()  # the rows of evaluation.json
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    vecnormalize: Path | None = None  # statistics that were given
 
 
-def find_trained(path: Path, algo: str | None, env_id: str | None, command: str | None) -> Trained:
+def find_trained(
+    path: Path, algo: str | None, env_id: str | None, command: str | None, vecnormalize: Path | None = None
+) -> Trained:
     """Reads what a run left; what is given takes the place of what is found.
 
     :param path: the output folder of ``sb3-sap demo`` or of ``sb3-sap train``, or the .zip of any model of this package
     :raise FileNotFoundError: if there is no model
-    :raise ValueError: if something is neither found nor given, or the model wants normalised observations
+    :raise ValueError: if something is neither found nor given
     """
     from sb3_sap.algorithms import ALGORITHMS
 
@@ -93,7 +66,8 @@ def find_trained(path: Path, algo: str | None, env_id: str | None, command: str 
         raise ValueError(f"{model} does not say how it was made: add {' and '.join(missing)}.")
     if given["algo"] not in ALGORITHMS:
         raise ValueError(f"--algo {given['algo']!r} is unknown: {nearest(given['algo'], ALGORITHMS)}")
-    return Trained(model, given["algo"], given["env"], given["command"], tuple(laps), run.get("env_kwargs", {}))
+    kwargs = run.get("env_kwargs", {})
+    return Trained(model, given["algo"], given["env"], given["command"], tuple(laps), kwargs, vecnormalize)
 
 
 def _zoo_run(folder: Path) -> dict[str, Any]:
@@ -101,11 +75,6 @@ def _zoo_run(folder: Path) -> dict[str, Any]:
     found = next(folder.glob("*/command.txt"), None)
     if found is None:
         return {}
-    if found.with_name("vecnormalize.pkl").is_file():
-        raise ValueError(
-            f"{folder} normalises observations, which the model file does not hold: publish it with RL Zoo's own "
-            "command, python -m rl_zoo3.push_to_hub."
-        )
     words = found.read_text(encoding="utf-8").split()  # RL Zoo joins its arguments without quotes
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
@@ -148,14 +117,18 @@ def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) 
     validate_repo_id(repo_id)
     class_name = ALGORITHMS[trained.algo].__name__
     filename = ModelName(trained.algo, EnvironmentName(trained.env_id)).filename
-    sources = {filename: trained.model} | {name: trained.model.with_name(name) for name in EXTRAS}
+    policy = load_policy(trained.model, trained.vecnormalize)
+    sources, use = {filename: trained.model}, USE
+    if isinstance(policy, NormalisedPolicy):
+        sources[FILE_NAME], use = policy.path, USE_NORMALISED
+    sources |= {name: trained.model.with_name(name) for name in EXTRAS}
     files = []
     for name, source in sources.items():
         if source.is_file():
             with atomic_path(folder / name) as temporary:
                 shutil.copyfile(source, temporary)
             files.append(folder / name)
-    metric, value, results = _laps(trained) if trained.laps else _episodes(trained, n_episodes)
+    metric, value, results = _laps(trained) if trained.laps else _episodes(policy, trained, n_episodes)
     data = ModelCardData(
         library_name="stable-baselines3",
         license="mit",
@@ -178,8 +151,13 @@ def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) 
         class_name=class_name,
         pictures="".join(f"\n\n![{Path(name).stem.replace('_', ' ')}]({name})" for name in shown),
         results=results,
-        repo_id=repo_id,
-        filename=filename,
+        use=use.format(
+            class_name=class_name,
+            repo_id=repo_id,
+            filename=filename,
+            statistics=FILE_NAME,
+            env_arguments=env_arguments(trained.env_id, trained.env_kwargs),
+        ),
         command=trained.command,
         version=__version__,
         sb3_version=stable_baselines3.__version__,
@@ -198,15 +176,13 @@ def _laps(trained: Trained) -> tuple[str, str, str]:
     return "mean_score", f"{mean:.3f}", f"{note}\n\n{table}"
 
 
-def _episodes(trained: Trained, n: int) -> tuple[str, str, str]:
+def _episodes(policy: BasePolicy | NormalisedPolicy, trained: Trained, n: int) -> tuple[str, str, str]:
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.monitor import Monitor
 
-    from sb3_sap.evaluation import load_policy, make_env
-
     env = Monitor(make_env(trained.env_id, **trained.env_kwargs))
     env.reset(seed=0)
-    mean, deviation = evaluate_policy(load_policy(trained.model), env, n)
+    mean, deviation = evaluate_policy(policy, env, n)
     env.close()
     value = f"{mean:.2f} +/- {deviation:.2f}"
     return "mean_reward", value, f"Mean return of {n} episodes with the policy alone: **{value}**."
@@ -230,6 +206,7 @@ def add_push_to_hub(commands: argparse._SubParsersAction[argparse.ArgumentParser
     command.add_argument("--env", help="the environment's id, the same")
     command.add_argument("--command", help="the command that trained the model, the same")
     command.add_argument("--episodes", type=positive, default=10, help="to evaluate where there are no laps (10)")
+    add_vecnormalize(command)
     command.add_argument("--out", type=Path, help="where to write what is uploaded; `hub` beside the model")
     command.add_argument("--dry-run", action="store_true", help="write it, and upload nothing")
     command.set_defaults(run=_push_to_hub)
@@ -240,7 +217,7 @@ def _push_to_hub(options: argparse.Namespace, console: Console) -> int:
         from huggingface_sb3 import push_to_hub
     except ModuleNotFoundError as error:
         raise ImportError(f"The Hub's integration is not installed ({error}): pip install sb3-sap[hub].") from error
-    trained = find_trained(options.path, options.algo, options.env, options.command)
+    trained = find_trained(options.path, options.algo, options.env, options.command, options.vecnormalize)
     folder = options.out or trained.model.parent / "hub"
     files = prepare(trained, options.repo_id, folder, options.episodes)
     console.print(f"{', '.join(file.name for file in files)} are in [bold]{folder}/[/]")

@@ -243,7 +243,7 @@ def test_frozen_layers_stay_as_they_are_and_the_others_learn(algorithm):
     after = weights(model.policy)
     changed = {name for name, value in before.items() if not th.equal(value, after[name])}
     assert changed
-    assert not [name for name in changed if "extractor" in name]
+    assert not [name for name in changed if "extractor" in name and "target" not in name]  # averaging rounds
 
 
 def test_an_actor_that_is_frozen_altogether_stays_as_it_is():

@@ -1,13 +1,18 @@
 """`sb3-sap push-to-hub`, up to the call over the network."""
 
 import json
+import re
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from huggingface_hub import HfApi, ModelCard
-from toy import build
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from toy import Line, build
 
 from sb3_sap import DDPGAP
 from sb3_sap.cli import main
+from sb3_sap.evaluation import load_policy
 from sb3_sap.hub import find_trained, prepare
 
 LAPS = [
@@ -117,10 +122,37 @@ def test_the_best_model_of_a_zoo_run_goes_first(zoo_run):
     assert push(zoo_run, "--repo-id", "me/p", "--dry-run", "--episodes", 1) == 0
 
 
-def test_a_model_that_wants_normalised_observations_is_refused(zoo_run, capsys):
-    (zoo_run / "Pendulum-v1" / "vecnormalize.pkl").touch()
-    assert push(zoo_run, "--repo-id", "me/p", "--dry-run") == 1
-    assert "rl_zoo3.push_to_hub" in capsys.readouterr().err
+def test_statistics_go_along_and_the_card_loads_both(zoo_run, uploads, monkeypatch):
+    statistics = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    statistics.obs_rms.mean = np.array([0.1, 0.2, 3.0])
+    statistics.save(zoo_run / "Pendulum-v1" / "vecnormalize.pkl")
+    assert push(zoo_run, "--repo-id", "me/p", "--episodes", 1) == 0
+    assert [name for name, _ in uploads if name != "create"] == [
+        "ddpg-Pendulum-v1.zip",
+        "vecnormalize.pkl",
+        "README.md",
+    ]
+
+    [use] = re.findall(r"```python\n(.*?)```", ModelCard.load(zoo_run / "hub" / "README.md").text, re.DOTALL)
+    monkeypatch.setattr("huggingface_sb3.load_from_hub", lambda repo_id, filename: str(zoo_run / "hub" / filename))
+    names = {}
+    exec(use, names)
+    model, env = names["model"], names["env"]
+    assert model.get_vec_normalize_env() is env
+    assert env.obs_rms.mean.tolist() == [0.1, 0.2, 3.0]
+    assert not env.training
+    assert env.get_attr("g") == [9.81]  # of the run's entry
+    obs = np.array([[0.5, 0.5, 2.0]], dtype=np.float32)
+    expected = model.predict(env.normalize_obs(obs), deterministic=True)[0]
+    loaded = load_policy(zoo_run / "Pendulum-v1.zip")
+    assert np.array_equal(loaded.predict(obs, deterministic=True)[0], expected)
+
+
+def test_statistics_that_are_missing_are_asked_for(run, uploads, capsys):
+    build(DDPGAP, VecNormalize(DummyVecEnv([Line]))).learn(12).save(run / "model.zip")
+    assert push(run, "--repo-id", "me/car") == 1
+    assert "give them with `--vecnormalize FILE`" in capsys.readouterr().err
+    assert uploads == []
 
 
 def test_any_other_model_is_evaluated(tmp_path, uploads):

@@ -13,8 +13,8 @@ PACKAGE = Path(sb3_sap.__file__).parent
 # From the top. A room may use those below it and its neighbours on the same floor.
 FLOORS = (
     {"cli"},
-    {"demo", "hub"},
-    {"zoo", "benchmark", "evaluation", "plots", "beliefs", "presets", "statistics"},
+    {"demo", "hub", "card"},
+    {"zoo", "benchmark", "evaluation", "normalisation", "plots", "beliefs", "presets", "statistics"},
     {"algorithms"},
     {"exploration", "check", "trials", "quick_classifier"},
     {"learning"},

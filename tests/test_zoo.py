@@ -3,11 +3,16 @@
 import io
 import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from contextlib import redirect_stdout
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -24,9 +29,12 @@ from sb3_sap.evaluation import ENVIRONMENTS, drive_lap, load_policy  # noqa: E40
 from sb3_sap.exploration import ActionPermissibilityMixin  # noqa: E402
 from sb3_sap.presets import load_config  # noqa: E402
 from sb3_sap.zoo.configs import check_hyperparameters  # noqa: E402
+from sb3_sap.zoo.figures import contour  # noqa: E402
 from sb3_sap.zoo.registration import register, small_buffers  # noqa: E402
+from sb3_sap.zoo.retest import summary  # noqa: E402
 from sb3_sap.zoo.spaces import t_k_range  # noqa: E402
 from sb3_sap.zoo.storages import SeededByTrial, is_surplus, open_storage, without_password  # noqa: E402
+from sb3_sap.zoo.workers import count_workers, run_workers  # noqa: E402
 
 ENV = "sap/LaneKeeping-v0"
 FOLDER = "sap-LaneKeeping-v0"
@@ -118,6 +126,21 @@ def test_the_default_entry_serves_other_environments():
     assert CountsEnds.ends == 1  # rl_zoo3 tells the first callback twice
 
 
+def test_modules_of_the_current_folder_are_found(monkeypatch):
+    """As `python -m sb3_sap.zoo` finds them; the console command has its own folder on the path instead."""
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != os.getcwd()])
+    Path("nearby_env.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('Nearby-v0', 'gymnasium.envs.classic_control:PendulumEnv', max_episode_steps=5)\n"
+        "def fine(obs, actions, next_obs):\n    return obs[:, 0] == obs[:, 0]\n"
+    )
+    entry = {"policy": "MlpPolicy", "n_timesteps": 20, "ap_function": "nearby_env.fine"}
+    Path("own.yml").write_text(yaml.safe_dump({"default": entry}))
+    command = ["train", "--gym-packages", "nearby_env", "--env", "Nearby-v0", "-n", "6", "--eval-freq", "-1"]
+    assert main([*command, "--conf-file", "own.yml", "-params", *QUICK]) == 0
+    assert sys.path.count(os.getcwd()) == 1
+
+
 def all_permissible(obs, actions, next_obs):
     return np.ones(len(actions), dtype=bool)
 
@@ -144,11 +167,21 @@ def test_watching_needs_no_buffers(tmp_path):
         (["-params", "alpha:2"], "`alpha` is a probability from 0 to 1, but is 2"),
         (["-params", "learning_rate:'1e-3'"], "write it with a point, 1.0e-3."),
         (["-params", "policy:'MlpPolcy'"], "did you mean 'MlpPolicy'?"),
+        (["-params", "normalize:True", "frame_stack:2"], "ddpg_ap cannot have `normalize` and `frame_stack` together"),
+        (
+            ["--algo", "sac", "-params", "normalize:dict(norm_obs=False)", "frame_stack:3"],
+            "VecFrameStack: {n_stack: 3}}]",
+        ),
+        (["--gym-packages", "json", "my_env"], "`--gym-packages`: 'my_env' cannot be imported (No module named"),
         (["--conf-file", "nowhere.yml"], "There is no configuration file nowhere.yml"),
         (["--trial-id", "0"], "give `--storage` and `--study-name`"),
         (["--validation-tracks", "eroad"], "one of the paper's test tracks"),
         (["--algo", "ddpg", "--guidance-only"], "which ddpg has not"),
         (["-optimize", "--sampler", "auto"], "OptunaHub, over the network, and optunahub is missing"),
+        (
+            ["-optimize", "--n-jobs", "0"],
+            "`--n-jobs` must be at least 1, or -1 for a worker of each processor, but is 0.",
+        ),
         (["--storage", "study.sqlite", "--study-name", "x", "--trial-id", "0"], "neither a database URL"),
         (["--storage", "sqlite:///empty.db", "--study-name", "x", "--trial-id", "0"], "There is no study 'x'"),
         (["--storage", "sqlite:////no/folder/x.db", "--study-name", "x", "--trial-id", "0"], "cannot be opened"),
@@ -180,6 +213,10 @@ def test_values_that_are_no_python(capsys):
             "default: {policy: MlpPolicy, n_timesteps: 10, t_kk: 5}",
             "the key 't_kk' is unknown to ddpg_ap: did you mean 't_k'?",
         ),
+        (
+            "default: {policy: MlpPolicy, n_timesteps: 10, normalize: '{\"norm_reward\": False}', frame_stack: 2}",
+            "own.yml: ddpg_ap cannot have `normalize` and `frame_stack` together",
+        ),
         ("default: {policy: MlpPolicy, n_timesteps: 10, env_wrapper: gymnasium.Nothing}", "cannot be imported"),
     ],
 )
@@ -187,6 +224,18 @@ def test_what_is_wrong_with_a_yaml_file(text, sentence, capsys):
     Path("own.yml").write_text(text)
     assert main(["train", "--env", ENV, "-n", "10", "--conf-file", "own.yml"]) == 1
     assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings"),
+    [
+        ("ppo", {"normalize": True, "frame_stack": 2}),  # which keeps what it is given
+        ("sac", {"normalize": False, "frame_stack": 2}),
+        ("sac", {"normalize": True, "frame_stack": 1}),
+    ],
+)
+def test_frames_may_be_stacked_where_nothing_is_normalised_below(algo, settings):
+    check_hyperparameters(algo, settings, "own.yml")
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -291,6 +340,84 @@ def test_optimize_replay_retest(capsys):
 
 
 @pytest.mark.slow
+def test_trials_of_workers_side_by_side_are_those_of_one():
+    flags = ["--n-trials", "3", "--n-startup-trials", "3", "--no-optim-plots"]
+    assert optimize("--storage", "one.log", *flags) == 0
+    assert optimize("--n-jobs", "2", *flags) == 0
+    [file] = Path("logs").rglob("study.log")  # where a study is kept of which no storage was named
+    alone, together = (
+        optuna.load_study(study_name="study", storage=open_storage(str(path))).trials for path in ("one.log", file)
+    )
+    assert [(t.params, t.user_attrs["seed"], t.value) for t in together] == [
+        (t.params, t.user_attrs["seed"], t.value) for t in alone
+    ]
+    assert len({trial.user_attrs["worker"] for trial in together}) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_the_command_that_started_them(end):
+    command = [sys.executable, "-m", "sb3_sap.zoo", "optimize", "--env", ENV, "-n", "100000", "--guidance-only"]
+    command += ["--n-jobs", "2", "--storage", "study.log", "--study-name", "study"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    running = optuna.trial.TrialState.RUNNING
+
+    def trials():
+        if not Path("study.log").exists():
+            return []
+        try:
+            return optuna.load_study(study_name="study", storage=open_storage("study.log")).trials
+        except KeyError:  # the file is there, and the study not yet
+            return []
+
+    try:
+        for begun in (True, False):
+            deadline = time.monotonic() + 120
+            while (len(trials()) < 2) if begun else any(trial.state == running for trial in trials()):
+                assert time.monotonic() < deadline
+                time.sleep(0.5)
+            process.send_signal(end)
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """A worker that fails where it has two trials, and else leaves a file once its pipe is closed."""
+    Path("worker").write_text(
+        '#!/bin/sh\ncase "$*" in\n  *"--n-trials 2") exit 3;;\n  *) cat; echo "$@" > ended;;\nesac\n'
+    )
+    Path("worker").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(Path("worker").absolute()))
+
+
+def test_a_worker_that_fails_ends_the_others(stand_in):
+    with pytest.raises(RuntimeError, match="ended with exit status 3, and the others were ended"):
+        run_workers("sb3-sap optimize --seed 1 --n-jobs 2", 2, 3, ["--seed", "7"])
+    told = "-m sb3_sap.zoo optimize --seed 1 --n-jobs 2 --seed 7 --n-jobs 1 --worker --n-trials 1"
+    assert Path("ended").read_text().strip() == told
+
+
+def test_ctrl_c_ends_workers(stand_in, monkeypatch):
+    def interrupt(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_workers("sb3-sap optimize", 1, 1, [])
+    assert Path("ended").exists()
+
+
+def test_how_many_workers():
+    assert [count_workers(n_jobs, 3) for n_jobs in (1, 2, 5)] == [1, 2, 3]
+    assert count_workers(-1, 10_000) == os.cpu_count()
+    for n_jobs in (0, -2):
+        with pytest.raises(ValueError, match=f"`--n-jobs` must be at least 1, or -1 .* but is {n_jobs}"):
+            count_workers(n_jobs, 3)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("pruner", ["median", "halving"])
 def test_nothing_is_pruned_before_every_trial_is_guided(pruner):
     """Every trial but the first would be pruned at once, because it is worse."""
@@ -323,6 +450,35 @@ def test_a_study_in_memory_leaves_a_report():
     assert Path("trials/trial_1/evaluations.npz").exists()
 
 
+@pytest.mark.parametrize(
+    ("seeds", "cells", "sentence"),
+    [
+        ({"default": 1, "trial 0": 1}, ["| 0.5 |  |", "| 0.75 | +0.25 |"], "One seed: no interval."),
+        ({"default": 2, "trial 0": 1}, ["| 0.5 [0.5, 0.5] |", "| +0.25 |"], "Where there is one seed: no interval."),
+        ({"default": 2, "trial 0": 2}, ["| 0.75 [0.75, 0.75] | +0.25 [+0.25, +0.25] |"], "95 %"),
+    ],
+)
+def test_one_seed_has_no_interval(seeds, cells, sentence):
+    study = optuna.create_study(study_name="study")
+    study.tell(study.ask(), 0.9)
+    scores = {"default": 0.5, "trial 0": 0.75}
+    rows = [
+        {"arm": arm, "seed": seed, "task": "t", "score": scores[arm]} for arm in seeds for seed in range(seeds[arm])
+    ]
+    text = summary(pd.DataFrame(rows), study, ["t"], "sb3-sap retest")
+    assert sentence in text
+    for cell in cells:
+        assert cell in text
+
+
+@pytest.mark.parametrize(("n_trials", "title"), [(1, "only 1 trial,"), (6, "only 6 trials,"), (20, "20 trials, the")])
+def test_a_picture_of_few_trials_says_that_it_is_thin(n_trials, title):
+    study = optuna.create_study(study_name="study", sampler=optuna.samplers.RandomSampler(seed=1))
+    study.optimize(lambda trial: trial.suggest_float("x", 0, 1) + trial.suggest_float("y", 0, 1), n_trials)
+    [axis, *_] = contour(study, "x", "y", "value").axes
+    assert axis.get_title().startswith(f"study: {title}")
+
+
 def test_a_tuned_noise_of_none_is_loaded():
     study = optuna.create_study(study_name="study", storage=open_storage("study.log"), direction="maximize")
     space = {"using_her_replay_buffer": False, "her_kwargs": {}}
@@ -340,6 +496,12 @@ def test_a_study_of_something_else_is_not_continued(capsys):
     study.set_user_attr("algo", "sac_ap")
     assert optimize("--storage", "study.log") == 1
     assert "is one of sac_ap on sap/LaneKeeping-v0, not of ddpg_ap" in capsys.readouterr().err
+
+
+def test_retest_has_no_workers(capsys):
+    command = ["retest", "--env", ENV, "-n", "10", "--n-jobs", "2", "--storage", "study.log", "--study-name", "study"]
+    assert main(command) == 1
+    assert "trains one model after the other: leave `--n-jobs` out" in capsys.readouterr().err
 
 
 def test_help_tells_ours_and_theirs(capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import runpy
 import shlex
 from argparse import ArgumentParser, Namespace
@@ -35,15 +36,28 @@ def run(arguments: list[str]) -> int:
         known = ", ".join(RUNNERS)
         raise ValueError(f"{f'{arguments[0]!r} is no command' if arguments else 'A command is missing'}: {known}.")
     register()
-    env_id = _given(arguments[1:]).env
-    if env_id:
-        find_environment(env_id)
+    given = _given(arguments[1:])
+    for package in given.gym_packages:
+        _import_environments(package)
+    if given.env:
+        find_environment(given.env)
     try:
         RUNNERS[arguments[0]](arguments[0], arguments[1:])
     except AssertionError as error:
         # rl_zoo3 says so of what it does not find.
         raise ValueError(str(error) or "rl_zoo3 gave up without a reason.") from error
     return 0
+
+
+def _import_environments(package: str) -> None:
+    """What rl_zoo3 does with a ``--gym-packages``, which has the module register its environments."""
+    try:
+        importlib.import_module(package)
+    except ImportError as error:
+        raise ImportError(
+            f"`--gym-packages`: {package!r} cannot be imported ({error}): name a module of the current folder or of "
+            "the Python path, without .py."
+        ) from error
 
 
 def _train(command: str, arguments: list[str]) -> None:
@@ -83,6 +97,7 @@ def _given(rest: list[str]) -> Namespace:
         parser.add_argument(flag)
     for flag in ("--seed", "--trial-id"):
         parser.add_argument(flag, type=int)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("-f", "--folder")
     return parser.parse_known_args(rest)[0]
 

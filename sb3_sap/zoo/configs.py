@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import yaml
 from rl_zoo3 import ALGOS
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.errors import nearest
 from sb3_sap.permissibility import resolve
@@ -84,9 +85,21 @@ def check_hyperparameters(algo: str, hyperparams: Mapping[str, Any], source: str
             _check_dotted(key, value)
     if "n_timesteps" in hyperparams:
         _check_kinds("n_timesteps", hyperparams["n_timesteps"], ["int", "float"], source)  # 1e6 is a float to YAML
+    if hyperparams.get("normalize") and hyperparams.get("frame_stack", 1) != 1:
+        _check_stacking(algo, algorithm, hyperparams["frame_stack"], source)
     policy = hyperparams.get("policy", "MlpPolicy")
     if isinstance(policy, str) and "." not in policy and policy not in algorithm.policy_aliases:
         raise ValueError(f"{source}: `policy` {policy!r} is unknown: {nearest(policy, algorithm.policy_aliases)}")
+
+
+def _check_stacking(algo: str, algorithm: Any, frame_stack: Any, source: str) -> None:
+    """Refuses frames stacked on top of VecNormalize, whose raw observations, without stacks, a replay buffer holds."""
+    if issubclass(algorithm, OffPolicyAlgorithm):
+        raise ValueError(
+            f"{source}: {algo} cannot have `normalize` and `frame_stack` together, for RL Zoo stacks what is "
+            "normalised already: in place of `frame_stack` stack first, `vec_env_wrapper: [{"
+            f"stable_baselines3.common.vec_env.VecFrameStack: {{n_stack: {frame_stack}}}}}]`."
+        )
 
 
 def _check_type(key: str, value: Any, parameter: inspect.Parameter, source: str) -> None:

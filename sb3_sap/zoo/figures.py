@@ -16,6 +16,8 @@ LEVELS = 12
 RESOLUTION = 100
 #: Trials within this share of a parameter's range are averaged: single trials are noisy.
 SMOOTHING = 0.1
+#: With fewer trials than this most of the surface is far from any of them.
+FEW = 20
 
 
 def completed(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
@@ -82,10 +84,16 @@ def contour(study: optuna.Study, x: str, y: str, target: str) -> Figure:
         axis.set_yscale("log")
         axis.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if str(value)[0] in "25" else ""))
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set(xlabel=x, ylabel=y, title=f"{study.study_name}: {len(points)} trials, the surface averages neighbours")
+    axis.set(xlabel=x, ylabel=y, title=f"{study.study_name}: {_how_much_it_says(len(points))}")
     axis.set_facecolor("0.7")
     figure.legend(loc="outside lower center", ncols=3, facecolor="0.7")
     return figure
+
+
+def _how_much_it_says(n_trials: int) -> str:
+    if n_trials >= FEW:
+        return f"{n_trials} trials, the surface averages neighbours"
+    return f"only {n_trials} trial{'s' * (n_trials != 1)}, too few to believe colours between them"
 
 
 def _neighbourhood(grid: Any, positions: Any) -> Any:

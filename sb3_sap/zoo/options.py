@@ -17,6 +17,7 @@ class StudyOptions:
     guidance_only: bool = False
     validation_tracks: list[str] = field(default_factory=list)
     heartbeat: int = 60  # s
+    worker: bool = False  # started by a command with `--n-jobs`, which writes the report
     best: int = 3
     runs: int = 10
     tracks: list[str] = field(default_factory=list)
@@ -46,6 +47,7 @@ def study_parser(command: str) -> argparse.ArgumentParser:
         metavar="SECONDS",
         help="a worker that gives no sign of life for twice as long is taken for dead, and its trial is run again",
     )
+    group.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     if command == "retest":
         group.add_argument("--best", type=int, default=default.best, help="how many of the best trials to train again")
         group.add_argument("--runs", type=int, default=default.runs, help="seeds for each of them, counted from --seed")

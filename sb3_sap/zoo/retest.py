@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ class RetestManager(StudyManager):
     def hyperparameters_optimization(self) -> None:
         if not (self.storage and self.study_name):
             raise ValueError("`retest` needs a study: give `--storage` and `--study-name`.")
+        if self.n_jobs != 1:
+            raise ValueError("`retest` trains one model after the other: leave `--n-jobs` out.")
         study = load_study(self.storage, self.study_name)
         check_belongs(study, self.algo, self.env_name.gym_id)
         self._follow(study)
@@ -110,20 +113,29 @@ def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str], command:
     for arm, matrix in scores.items():
         trial = trials.get(str(arm))
         changed = ", ".join(f"{name} {shown(value)}" for name, value in trial.params.items()) if trial else ""
-        low, high = bootstrap_interval(matrix)
         row = [arm, changed, shown(trial.value) if trial else "", len(matrix)]
-        row += [f"{interquartile_mean(matrix):.4g} [{low:.4g}, {high:.4g}]"]
+        row.append(f"{interquartile_mean(matrix):.4g}" + _interval(bootstrap_interval(matrix), ".4g", matrix))
         if arm == DEFAULT or DEFAULT not in scores:
             row.append("")
         else:
-            difference, low, high = bootstrap_difference(matrix, scores[DEFAULT])
-            row.append(f"{difference:+.3g} [{low:+.3g}, {high:+.3g}]")
+            difference, *interval = bootstrap_difference(matrix, scores[DEFAULT])
+            row.append(f"{difference:+.3g}" + _interval(interval, "+.3g", matrix, scores[DEFAULT]))
         table.append(row)
     header = ["settings", "changed", "in the study", "seeds", "interquartile mean", "minus default"]
     tasks = f"Laps: {', '.join(tracks)}." if tracks else f"{target_name(study).capitalize()}."
     title, made = f"# Winners of {study.study_name} on fresh seeds", f"`{without_password(command)}`"
-    lines = [title, "", made, "", f"{tasks} 95 % stratified bootstrap intervals.", ""]
+    intervals = "95 % stratified bootstrap intervals."
+    if any(len(matrix) == 1 for matrix in scores.values()):
+        alone = all(len(matrix) == 1 for matrix in scores.values())
+        intervals = "One seed: no interval." if alone else f"{intervals} Where there is one seed: no interval."
+    lines = [title, "", made, "", f"{tasks} {intervals}", ""]
     return "\n".join([*lines, *markdown_table(header, table)]) + "\n"
+
+
+def _interval(interval: Sequence[float], digits: str, *matrices: Any) -> str:
+    """In brackets; nothing where some matrix has one run, which says nothing of how far runs scatter."""
+    low, high = interval
+    return "" if any(len(matrix) == 1 for matrix in matrices) else f" [{low:{digits}}, {high:{digits}}]"
 
 
 def _matrix(rows: pd.DataFrame) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import platform
+from pathlib import Path
 from pprint import pformat
 from typing import Any
 
@@ -27,7 +28,7 @@ from sb3_sap.zoo.report import write_report
 from sb3_sap.zoo.reporting import ReportingCallback
 from sb3_sap.zoo.spaces import t_k_range
 from sb3_sap.zoo.storages import check_belongs, is_surplus, open_storage, without_password
-from sb3_sap.zoo.workers import SurplusTrial, work_until
+from sb3_sap.zoo.workers import SurplusTrial, count_workers, end_with_parent, run_workers, work_until
 
 
 class StudyManager(GuidedExperimentManager):
@@ -132,6 +133,10 @@ class StudyManager(GuidedExperimentManager):
         return super()._create_pruner(pruner_method)
 
     def hyperparameters_optimization(self) -> None:
+        n_workers = count_workers(self.n_jobs, self.max_total_trials or self.n_trials)
+        if n_workers > 1 and self.storage is None:
+            self.storage = str(Path(self.save_path) / "study.log")
+            print(f"The study is kept in {self.storage}")
         study = optuna.create_study(
             sampler=self._create_sampler(self.sampler),
             pruner=self._create_pruner(self.pruner),
@@ -141,13 +146,22 @@ class StudyManager(GuidedExperimentManager):
             direction="maximize",
         )
         self._describe(study)
+        if self.options.worker:
+            end_with_parent()
         try:
-            if self.max_total_trials is None:
-                study.optimize(self.objective, n_trials=self.n_trials, n_jobs=self.n_jobs, gc_after_trial=True)
+            if n_workers > 1:
+                flags = ["--storage", str(self.storage), "--study-name", study.study_name, "--seed", str(self.seed)]
+                run_workers(self.options.command, n_workers, self.n_trials, flags)
+            elif self.max_total_trials is None:
+                study.optimize(self.objective, n_trials=self.n_trials, gc_after_trial=True)
             else:
-                work_until(study, self.objective, self.max_total_trials, self.n_jobs)
+                work_until(study, self.objective, self.max_total_trials)
         except KeyboardInterrupt:
             print("Interrupted: the trials that are finished stay in the study.")
+        if not self.options.worker:
+            self._report(study)
+
+    def _report(self, study: optuna.Study) -> None:
         folder = write_report(study, self.log_folder, self.algo, self.env_name, pictures=not self.no_optim_plots)
         print((folder / "report.md").read_text(encoding="utf-8"))
         print(f"The report is in {folder}")

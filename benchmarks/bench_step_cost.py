@@ -1,11 +1,14 @@
 """What guidance costs for each training step: every guided algorithm beside its own base at equal settings.
 
+First with the settings of presets, then, with ``--bare``, as the constructors give them: SB3's defaults and ours.
+
 The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that whatever else
 the machine does meets both; processor time is counted, over all of a run but its first 50 steps, which are random. The
 parts are measured inside the guided model. Below the cost of fitting E lies that of its matrix products alone, which no
 other way of writing the same fit avoids.
 
 python benchmarks/bench_step_cost.py [--pairs ddpg:fast 'td3:fast[teaching_growth=0]' …]   # writes .csv and .md
+python benchmarks/bench_step_cost.py --bare   # writes a further .csv and the second table of the .md
 """
 
 import argparse
@@ -20,6 +23,7 @@ import pandas as pd
 import torch as th
 
 import sb3_sap.exploration
+from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.columns import Column, parse_column
 from sb3_sap.benchmark.learners import algorithm_class, make_model, settings_of
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
@@ -30,6 +34,9 @@ PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
     *("td3:fast[teaching_growth=null]", "sac:fast[teaching_growth=0]"),
 )
+#: Bases with the constructors' own settings; those of finite actions drive up a hill, the others a car on TORCS.
+BARE = ("ddpg", "td3", "sac", "tqc", "crossq", "dqn", "qrdqn")
+HEADINGS = ("# With the settings of presets", "# As the constructors give them")
 CHUNK = 50
 PARTS = ("fit E", "validate E", "teach the actor", "Algorithm 1")
 seconds: defaultdict[str, float] = defaultdict(float)
@@ -61,6 +68,15 @@ def build(algo: str, settings: dict):
     return make_model(algo, env, {name: value for name, value in settings.items() if name in known}, seed=100)
 
 
+def build_bare(algo: str) -> Any:
+    guided: Any = ALGORITHMS[f"{algo.removesuffix('_ap')}_ap"]
+    cls = guided if algo.endswith("_ap") else guided.__bases__[-1]
+    if guided.discrete:
+        labels = {"ap_function": "sb3_sap.tasks.mountain_car"} if cls is guided else {}
+        return cls("MlpPolicy", gym.make("MountainCar-v0"), seed=100, **labels)
+    return cls("MlpPolicy", gym.make("sap/TorcsLaneKeeping-v0", track="wheel-2", laps=None), seed=100)
+
+
 def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
     """Seconds of the matrix products in one gradient step of E: forward, and backward by weights and by inputs."""
     layers = [layer.weight.detach() for layer in predictor.head if isinstance(layer, th.nn.Linear)]
@@ -78,10 +94,13 @@ def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
 
 def measure(pair: str, steps: int) -> dict[str, object]:
     """One row: milliseconds a step of both models, and of the guided one's parts."""
-    column = parse_column(pair)
-    guided = Column(f"{column.algo}_ap", column.preset, column.overrides)
-    settings = settings_of(guided, "torcs", steps)
-    models = [build(algo, settings) for algo in (column.algo, guided.algo)]
+    if pair in BARE:
+        models = [build_bare(algo) for algo in (pair, f"{pair}_ap")]
+    else:
+        column = parse_column(pair)
+        guided = Column(f"{column.algo}_ap", column.preset, column.overrides)
+        settings = settings_of(guided, "torcs", steps)
+        models = [build(algo, settings) for algo in (column.algo, guided.algo)]
     spent = [0.0, 0.0]
     seconds.clear()
     for done in range(0, steps, CHUNK):
@@ -97,10 +116,20 @@ def measure(pair: str, steps: int) -> dict[str, object]:
     return row | {f"{part}, ms": f"{1000 * seconds[part] / steps:.2f}" for part in (*PARTS, "E's matrix products")}
 
 
+def replace_section(path: Path, number: int, text: str) -> None:
+    """Writes one of the two tables of the page and leaves the other as it is."""
+    page = path.read_text(encoding="utf-8") if path.is_file() else ""
+    first, _, second = page.partition(f"{HEADINGS[1]}\n\n")
+    sections = [first.removeprefix(f"{HEADINGS[0]}\n\n").strip(), second.strip()]
+    sections[number] = text.strip()
+    write_text(path, "\n\n".join(part for pair in zip(HEADINGS, sections, strict=True) for part in pair) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--pairs", nargs="+", default=PAIRS)
+    parser.add_argument("--bare", action="store_true", help=f"the constructors of {', '.join(BARE)} instead")
     parser.add_argument("--out", type=Path, default=Path("docs/results/step_cost.csv"))
     options = parser.parse_args()
     if options.steps < 2 * CHUNK or options.steps % CHUNK:
@@ -108,13 +137,16 @@ def main() -> None:
     th.set_num_threads(1)
     watch_the_parts()
     rows = []
-    for pair in options.pairs:
+    csv = options.out.with_stem(f"{options.out.stem}_bare") if options.bare else options.out
+    for pair in BARE if options.bare else options.pairs:
         rows.append(measure(pair, options.steps))
         print(rows[-1], flush=True)
         table, made = pd.DataFrame(rows), provenance()
-        write_csv(options.out, table)
+        write_csv(csv, table)
         of = f"{options.steps:,} steps, on {made['machine']}, {made['date']}, revision {made['revision']}."
-        write_text(options.out.with_suffix(".md"), f"{markdown(table)}\nProcessor time of a step over {of}\n")
+        replace_section(
+            options.out.with_suffix(".md"), options.bare, f"{markdown(table)}\nProcessor time of a step over {of}\n"
+        )
 
 
 if __name__ == "__main__":

@@ -57,8 +57,7 @@ class PermissibilityCallback(BaseCallback):
         if new.any():
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
         due = self.model.refits_due(self._start // self.model.n_envs, self.model.life_steps // self.model.n_envs)
-        if self.model.refit_growth is None and self.model.gradient_steps >= 0:
-            due = min(due, max(1, self.model.gradient_steps))  # no more often than the base trains
+        due = int(min(due, self.model.fits_per_rollout))
         if min(knowledge.counts("train")) >= self.model.min_per_class:
             for _ in range(due):
                 self.fit()

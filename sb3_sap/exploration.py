@@ -131,10 +131,9 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
         return self.guidance_ended and self.teaching_growth is None
 
     def refits_due(self, before: int, now: int) -> int:
-        growth = self.refit_growth or 0.0
         if self.teaching_growth is not None:
-            return due(growth, before, now, apart=STEPS_BETWEEN_FITS)
-        return due(growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.predictor_rests else 1)
+            return due(self.refit_growth, before, now, apart=STEPS_BETWEEN_FITS)
+        return due(self.refit_growth, before, now, one_of=FITS_AFTER_GUIDANCE if self.predictor_rests else 1)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates
@@ -144,7 +143,7 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
             return
         step = permissible_value_step if self.discrete else permissible_actor_step
         if self.teaching_growth is None:
-            lessons = due(self.refit_growth or 0.0, before, self._n_updates)
+            lessons = due(self.refit_growth, before, self._n_updates)
         else:
             delay = getattr(self, "policy_delay", 1)  # of so many updates of TD3 or CrossQ one moves the actor
             lessons = due(self.teaching_growth, before // delay, self._n_updates // delay)

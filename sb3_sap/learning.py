@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import warnings
 from collections.abc import Iterable
 from typing import Any, cast
@@ -53,9 +54,11 @@ class LearnedPermissibilityMixin(SettingsMixin):
     :param validation_size: size of the balanced validation sample
     :param min_per_class: examples of each class that K must hold before E is fitted, and makes room for when it is full
     :param refit_growth: E is fitted and validated each time that the number of steps has grown by this fraction,
-        because a few new examples soon change little in it, while the cost of a fit stays; 0, the paper's: at every
-        step. ``None``: at every step too, but no more often than the base trains, which matters where one gradient
-        step follows several environment steps, as with DQN
+        because a few new examples soon change little in it, while the cost of a fit stays; 0: after every step, or as
+        often as ``predictor_gradient_steps`` says
+    :param predictor_gradient_steps: fits, at most, after each rollout, as ``gradient_steps`` of the base; -1: one for
+        each vectorised step. ``None``: as many as the base's gradient steps, which of DQN are fewer than its steps;
+        with a ``refit_growth`` above 0 that alone decides
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.PermissibilityPredictor`
     """
 
@@ -68,7 +71,8 @@ class LearnedPermissibilityMixin(SettingsMixin):
         dataset_size: int = 512,
         validation_size: int = 200,
         min_per_class: int = 20,
-        refit_growth: float | None = None,
+        refit_growth: float = 0.0,
+        predictor_gradient_steps: int | None = None,
         predictor_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ):
@@ -79,6 +83,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
         self.validation_size = validation_size
         self.min_per_class = min_per_class
         self.refit_growth = refit_growth
+        self.predictor_gradient_steps = predictor_gradient_steps
         self.predictor_kwargs = predictor_kwargs
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
@@ -94,8 +99,9 @@ class LearnedPermissibilityMixin(SettingsMixin):
 
     def _setup_model(self) -> None:
         check_at_least(self, knowledge_buffer_size=4, min_per_class=1, dataset_size=2, validation_size=2)
-        if self.refit_growth is not None:
-            check_growth(self, "refit_growth")
+        check_growth(self, "refit_growth")
+        if self.predictor_gradient_steps is not None:
+            check_at_least(self, predictor_gradient_steps=-1)
         if self.replay_buffer is None:
             self.replay_buffer = self._make_replay_buffer()
         # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
@@ -230,7 +236,16 @@ class LearnedPermissibilityMixin(SettingsMixin):
 
     def refits_due(self, before: int, now: int) -> int:
         """How many fits belong to the steps after ``before``, up to ``now``."""
-        return due(self.refit_growth or 0.0, before, now)
+        return due(self.refit_growth, before, now)
+
+    @property
+    def fits_per_rollout(self) -> float:
+        """How many fits may follow a rollout, whatever is due."""
+        steps: float | None = self.predictor_gradient_steps
+        if steps is None:
+            # A base that does not train at all leaves E one fit.
+            steps = max(1, self.gradient_steps) if self.refit_growth == 0 <= self.gradient_steps else -1
+        return steps if steps >= 0 else math.inf
 
     @property
     def predictor_suffices(self) -> bool:

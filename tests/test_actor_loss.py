@@ -168,7 +168,7 @@ class Permits:
 
 
 def finite(algorithm, **settings):
-    return build(algorithm, Line(n_actions=3), refit_growth=0.0, **settings).learn(60)
+    return build(algorithm, Line(n_actions=3), predictor_gradient_steps=-1, **settings).learn(60)
 
 
 @pytest.mark.parametrize("algorithm", DISCRETE)
@@ -206,7 +206,7 @@ def test_where_e_tells_no_actions_apart_nothing_moves(permitted):
 
 @pytest.mark.parametrize("algorithm", DISCRETE)
 def test_it_teaches_the_values_what_e_knows(algorithm):
-    settings = {"learning_starts": 400, "learning_rate": 0.01, "refit_growth": 0.0, **WIDE}
+    settings = {"learning_starts": 400, "learning_rate": 0.01, "predictor_gradient_steps": -1, **WIDE}
     model = build(algorithm, Line(n_actions=2), **settings).learn(400)
     assert model.validation_accuracy > 0.7
     for _ in range(200):

@@ -46,10 +46,12 @@ class NoCallback(BaseCallback):
         ({"train_freq": (1, "episode")}, 1, [5, 10, 15]),
         ({"train_freq": 2}, 2, [8, 12]),
         # or at every step,
-        ({"train_freq": 4, "refit_growth": 0.0}, 1, [8] * 4 + [12] * 4),
-        ({"train_freq": (1, "episode"), "refit_growth": 0.0}, 1, [5] * 5 + [10] * 5 + [15] * 5),
+        ({"train_freq": 4, "predictor_gradient_steps": -1}, 1, [8] * 4 + [12] * 4),
+        ({"train_freq": (1, "episode"), "predictor_gradient_steps": -1}, 1, [5] * 5 + [10] * 5 + [15] * 5),
+        ({"train_freq": 4, "refit_growth": 0.01}, 1, [8] * 4 + [12] * 4),
+        ({"train_freq": 4, "refit_growth": 0.01, "predictor_gradient_steps": 3}, 1, [8] * 3 + [12] * 3),
         # which is a vectorised step, after which two transitions are new.
-        ({"train_freq": 2, "refit_growth": 0.0}, 2, [8] * 2 + [12] * 2),
+        ({"train_freq": 2, "predictor_gradient_steps": -1}, 2, [8] * 2 + [12] * 2),
         ({"train_freq": 1}, 2, [8, 10, 12]),
         # A base that never trains leaves E its own fits.
         ({"train_freq": 1, "gradient_steps": 0}, 1, [8, 9, 10, 11, 12]),

@@ -111,7 +111,8 @@ def guided_buffer_class(
     requested: type[ReplayBuffer] | None, observation_space: spaces.Space[Any], n_steps: int
 ) -> type[KnowledgeMixin]:
     """The buffer class that SB3 would have chosen, or that the user asked for, in the form that feeds K."""
-    if requested is None:
+    # A loaded model remembers the buffer of its n_steps then.
+    if requested is None or requested is PermissibilityReplayBuffer:
         plain = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
         requested = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else plain
     guided = GUIDED_BUFFERS.get(requested, requested)

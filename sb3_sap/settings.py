@@ -40,6 +40,8 @@ PAPER_STEPS = 15_000
 LINEAR = r"lin_\d+\.?\d*(e-?\d+)?"
 #: Arguments that are functions of the user's.
 FUNCTIONS = ("ap_function", "constraint", "permissible_actions")
+#: Settings of SB3's whose effect a saved file holds, in a built network or the state of an optimizer.
+HELD = ("ent_coef", "use_sde")
 NOISES: dict[str, Callable[..., ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -71,6 +73,7 @@ class SettingsMixin(OffPolicyAlgorithm):
         **kwargs: Any,
     ):
         self.actor_learning_rate: Any = actor_learning_rate
+        self._held: dict[str, Any] = {}
         #: The images that the environment gives channels last, and the user's functions see so.
         self.images: tuple[str, ...] = ()
         if env is not None:
@@ -104,6 +107,14 @@ class SettingsMixin(OffPolicyAlgorithm):
         elif isinstance(action_noise, VectorizedActionNoise) and action_noise.n_envs != self.n_envs:
             # Saved with other environments: SB3 makes one for these when it learns.
             self.action_noise = action_noise.base_noise
+        held = {name: getattr(self, name) for name in HELD if hasattr(self, name)}
+        for name in held:
+            if self._held.get(name, held[name]) != held[name]:
+                raise ValueError(
+                    f"`{name}` = {held[name]!r} cannot be changed by `load`, because the file holds what {name} = "
+                    f"{self._held[name]!r} has become: leave it out, or build a new {type(self).__name__}."
+                )
+        self._held = held
         self._look_at(self.env)
         self._unsaved = [name for name in FUNCTIONS if not can_be_pickled(getattr(self, name, None))]
         for name in self._unsaved:

@@ -183,6 +183,8 @@ class Mine(KnowledgeMixin, ReplayBuffer):
         (ReplayBuffer, BOX, 1, PermissibilityReplayBuffer),
         (NStepReplayBuffer, BOX, 3, PermissibilityNStepReplayBuffer),
         (NStepReplayBuffer, BOX, 1, PermissibilityNStepReplayBuffer),
+        (PermissibilityReplayBuffer, BOX, 3, PermissibilityNStepReplayBuffer),
+        (PermissibilityNStepReplayBuffer, BOX, 1, PermissibilityNStepReplayBuffer),
         (DictReplayBuffer, DICT, 1, PermissibilityDictReplayBuffer),
         (HerReplayBuffer, DICT, 1, PermissibilityHerReplayBuffer),
         (PermissibilityHerReplayBuffer, DICT, 1, PermissibilityHerReplayBuffer),

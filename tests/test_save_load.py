@@ -11,7 +11,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import set_random_seed
 from toy import ALGORITHMS, CONSTRAINED, DISCRETE, GUIDED, Line, build, nearby, towards_centre
 
-from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, PermissibilityNStepReplayBuffer
+from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, SACAP, TQCAP, PermissibilityNStepReplayBuffer
 
 
 def flat(value, name=""):
@@ -326,3 +326,25 @@ def test_a_function_that_cannot_be_pickled_is_told_at_construction_and_costs_no_
     with pytest.warns(UserWarning, match="cannot be pickled"):
         loaded = DDPGAP.load(tmp_path / "model", env=Line(), **{name: functions[name]})
     assert getattr(loaded.learn(20), name) is functions[name]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "changed"),
+    [(SACAP, {"ent_coef": 0.2}), (SACAP, {"ent_coef": "auto_0.5"}), (TQCAP, {"use_sde": True})],
+)
+def test_load_refuses_what_the_file_holds_the_effect_of(tmp_path, algorithm, changed):
+    model = build(algorithm).learn(20)
+    model.save(tmp_path / "model")
+    [name] = changed
+    with pytest.raises(
+        ValueError, match=f"^`{name}` = .* cannot be changed by `load`.*build a new {algorithm.__name__}"
+    ):
+        algorithm.load(tmp_path / "model", env=Line(), **changed)
+    algorithm.load(tmp_path / "model", env=Line(), **{name: getattr(model, name)})
+
+
+@pytest.mark.parametrize("n_steps", [(1, 3), (3, 1)])
+def test_load_applies_other_n_steps(tmp_path, n_steps):
+    build(DDPGAP, n_steps=n_steps[0]).learn(20).save(tmp_path / "model")
+    loaded = DDPGAP.load(tmp_path / "model", env=Line(), n_steps=n_steps[1]).learn(20)
+    assert getattr(loaded.replay_buffer, "n_steps", 1) == n_steps[1]

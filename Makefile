@@ -3,6 +3,12 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Networks this small train no faster on two threads; two processes side by side do.
 export OMP_NUM_THREADS ?= 1
+# PyPI's torch for Linux is a CUDA build of several gigabytes; PyTorch's own index has one for the CPU, which pip prefers
+# for the `+cpu` of its version. `make demo TORCH_INDEX=` takes PyPI's, and a URL any other.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# torch alone is looked up there, and before the rest: an index that cannot be reached then costs a moment, not an error.
+TORCH_OPTIONS := --no-deps --retries 1 --timeout 10 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+PIP_INSTALL := pip install -q --disable-pip-version-check
 
 .PHONY: demo test test-all torcs lint docs coverage clean
 
@@ -34,7 +40,8 @@ coverage: .venv/.installed
 
 .venv/.installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e .[dev]
+	$(BIN)/$(PIP_INSTALL) $(TORCH_OPTIONS) -c constraints.txt torch
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e .[dev]
 	touch $@
 
 clean:

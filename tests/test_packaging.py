@@ -35,6 +35,10 @@ PROGRAMS = {
     "dask": "import distributed, sb3_sap.benchmark.runner",
     "docs": "import furo, myst_parser, sphinx.application",
     "hub": "import huggingface_sb3, sb3_sap.hub",
+    "tensorboard": """
+        sb3_sap.DDPG("MlpPolicy", "Pendulum-v1", tensorboard_log="boards").learn(10)
+        import tensorboard.program
+    """,
     "postgres": "import psycopg, sb3_sap.zoo.storages, sb3_sap.zoo.tuning",
     "zoo": 'main(["train", "--algo", "ddpg_ap", "--env", "sap/LaneKeeping-v0", "-n", "50", "-f", "logs"])',
 }

@@ -9,8 +9,11 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 # torch alone is looked up there, and before the rest: an index that cannot be reached then costs a moment, not an error.
 TORCH_OPTIONS := --no-deps --retries 1 --timeout 10 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 PIP_INSTALL := pip install -q --disable-pip-version-check
+LOWEST := .venv-lowest/bin
+# The release of torch beside the lowest versions of everything else. Of the lowest one, too: LOWEST_TORCH=torch==2.8.0
+LOWEST_TORCH ?= -c constraints.txt torch
 
-.PHONY: demo test test-all torcs lint docs coverage clean
+.PHONY: demo test test-all lowest torcs lint docs coverage clean
 
 demo: .venv/.installed
 	$(BIN)/sb3-sap demo
@@ -20,6 +23,14 @@ test: .venv/.installed
 
 test-all: test
 	$(BIN)/pytest -q -n 2 -m slow
+
+# Every extra, used with the lowest versions that setup.cfg admits, in an environment of their own.
+lowest:
+	$(PYTHON) -m venv --clear .venv-lowest
+	$(LOWEST)/$(PIP_INSTALL) -c constraints.txt uv
+	$(LOWEST)/$(PIP_INSTALL) $(TORCH_OPTIONS) $(LOWEST_TORCH)
+	$(LOWEST)/uv pip install -q --python .venv-lowest --resolution lowest-direct -e .[dev,peers]
+	$(LOWEST)/python tests/lowest.py
 
 # The reference simulator, from Debian's packages, without root.
 torcs: .venv/.installed
@@ -45,4 +56,4 @@ coverage: .venv/.installed
 	touch $@
 
 clean:
-	rm -rf .venv build dist docs/_build *.egg-info
+	rm -rf .venv .venv-lowest build dist docs/_build *.egg-info

@@ -3,8 +3,17 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Networks this small train no faster on two threads; two processes side by side do.
 export OMP_NUM_THREADS ?= 1
+# PyPI's torch for Linux is a CUDA build of several gigabytes; PyTorch's own index has one for the CPU, which pip prefers
+# for the `+cpu` of its version. `make demo TORCH_INDEX=` takes PyPI's, and a URL any other.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# torch alone is looked up there, and before the rest: an index that cannot be reached then costs a moment, not an error.
+TORCH_OPTIONS := --no-deps --retries 1 --timeout 10 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+PIP_INSTALL := pip install -q --disable-pip-version-check
+LOWEST := .venv-lowest/bin
+# The release of torch beside the lowest versions of everything else. Of the lowest one, too: LOWEST_TORCH=torch==2.8.0
+LOWEST_TORCH ?= -c constraints.txt torch
 
-.PHONY: demo test test-all torcs lint docs coverage clean
+.PHONY: demo test test-all lowest torcs lint docs coverage clean
 
 demo: .venv/.installed
 	$(BIN)/sb3-sap demo
@@ -14,6 +23,14 @@ test: .venv/.installed
 
 test-all: test
 	$(BIN)/pytest -q -n 2 -m slow
+
+# Every extra, used with the lowest versions that setup.cfg admits, in an environment of their own.
+lowest:
+	$(PYTHON) -m venv --clear .venv-lowest
+	$(LOWEST)/$(PIP_INSTALL) -c constraints.txt uv
+	$(LOWEST)/$(PIP_INSTALL) $(TORCH_OPTIONS) $(LOWEST_TORCH)
+	$(LOWEST)/uv pip install -q --python .venv-lowest --resolution lowest-direct -e .[dev,peers]
+	$(LOWEST)/python tests/lowest.py
 
 # The reference simulator, from Debian's packages, without root.
 torcs: .venv/.installed
@@ -34,8 +51,9 @@ coverage: .venv/.installed
 
 .venv/.installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e .[dev]
+	$(BIN)/$(PIP_INSTALL) $(TORCH_OPTIONS) -c constraints.txt torch
+	$(BIN)/$(PIP_INSTALL) -c constraints.txt -e .[dev]
 	touch $@
 
 clean:
-	rm -rf .venv build dist docs/_build *.egg-info
+	rm -rf .venv .venv-lowest build dist docs/_build *.egg-info

@@ -1,5 +1,6 @@
 """What is published: the wheel that is built from the sdist works with what it declares, and with nothing else."""
 
+import configparser
 import os
 import re
 import shutil
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.version import Version
 
 pytestmark = pytest.mark.slow
 
@@ -35,6 +37,10 @@ PROGRAMS = {
     "dask": "import distributed, sb3_sap.benchmark.runner",
     "docs": "import furo, myst_parser, sphinx.application",
     "hub": "import huggingface_sb3, sb3_sap.hub",
+    "tensorboard": """
+        sb3_sap.DDPG("MlpPolicy", "Pendulum-v1", tensorboard_log="boards").learn(10)
+        import tensorboard.program
+    """,
     "postgres": "import psycopg, sb3_sap.zoo.storages, sb3_sap.zoo.tuning",
     "zoo": 'main(["train", "--algo", "ddpg_ap", "--env", "sap/LaneKeeping-v0", "-n", "50", "-f", "logs"])',
 }
@@ -92,6 +98,29 @@ def brought_by(distribution, extra):
                 [installed] = metadata.distributions(name=needed.name)
                 wanted += [(installed, one) for one in needed.extras or {""}]
     return {name for name, _ in found}
+
+
+def declared():
+    """Every requirement of setup.cfg, of the core and of the extras."""
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    texts = [setup["options"]["install_requires"], *setup["options.extras_require"].values()]
+    return {Requirement(line) for text in texts for line in text.splitlines() if line}
+
+
+def lower_bound(requirement):
+    return max((Version(one.version) for one in requirement.specifier if one.operator == ">="), default=None)
+
+
+def test_every_requirement_has_a_lower_bound():
+    assert len(declared()) > 30
+    assert [str(one) for one in declared() if lower_bound(one) is None] == []
+
+
+def test_torch_is_no_older_than_sb3_wants_it():
+    [ours] = [one for one in declared() if one.name == "torch"]
+    [theirs] = [one for one in map(Requirement, metadata.requires("stable-baselines3")) if one.name == "torch"]
+    assert lower_bound(ours) >= lower_bound(theirs)
 
 
 def test_every_file_of_the_package_is_in_the_wheel(site):

@@ -128,3 +128,27 @@ def guided_buffer_class(
             "use `n_steps=1`, or array observations and no `replay_buffer_class`."
         )
     return guided
+
+
+def check_fits(loaded: ReplayBuffer, model: Any) -> None:
+    """Refuses a loaded buffer that a model cannot go on with.
+
+    :raise TypeError: if it holds no K
+    :raise ValueError: if it comes from another environment, or from another number of them
+    """
+    if not isinstance(loaded, KnowledgeMixin):
+        raise TypeError(
+            f"The file holds a plain {type(loaded).__name__} without a knowledge buffer: "
+            f"load one saved by {type(model).__name__}."
+        )
+    if loaded.n_envs != model.n_envs:
+        raise ValueError(
+            f"The file holds a replay buffer of {loaded.n_envs} environments, but this model has {model.n_envs}: "
+            "load the model with as many environments, or go on with an empty buffer."
+        )
+    for name in ("observation_space", "action_space"):
+        if getattr(loaded, name) != getattr(model, name):
+            raise ValueError(
+                f"The file holds a replay buffer whose {name} is {getattr(loaded, name)}, but this model's is "
+                f"{getattr(model, name)}: load one that was saved in the same environment."
+            )

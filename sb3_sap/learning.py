@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -13,20 +12,19 @@ import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_sap.buffers import KnowledgeMixin, guided_buffer_class
-from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback, every_callback
+from sb3_sap.buffers import KnowledgeMixin, check_fits, guided_buffer_class
+from sb3_sap.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.features import with_extractor
 from sb3_sap.generators import make_rng
 from sb3_sap.growth import check_growth, due
 from sb3_sap.knowledge import KnowledgeBuffer
 from sb3_sap.permissibility import APFunction, resolve
 from sb3_sap.predictor import PermissibilityPredictor
-from sb3_sap.settings import SettingsMixin, check_at_least
-from sb3_sap.vec_envs import never_updated, shares_environment, watched_steps
+from sb3_sap.settings import check_at_least
+from sb3_sap.watching import WatchedEnvironmentMixin
 
 #: Arguments of the predictor that its saved weights and optimizer depend on.
 BUILT = (
@@ -41,7 +39,7 @@ BUILT = (
 SUFFICIENT_ACCURACY = 0.7
 
 
-class LearnedPermissibilityMixin(SettingsMixin):
+class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     """Gives an SB3 off-policy algorithm a knowledge buffer K and an AP predictor E (section 4.2).
 
     What is done with E is another's business: the model acts and learns as its base does.
@@ -88,13 +86,10 @@ class LearnedPermissibilityMixin(SettingsMixin):
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
         self._steps_of_earlier_learns = 0
-        self._warned_of_sharing = False
         #: A raw observation amid those of the training, noted when the model is saved.
         self.typical_observation: Any = None
         #: What the predictor was built with: a saved one fits no other.
-        self._predictor_built: dict[str, str] = {}
-        #: Whether the observations of the last training were normalised.
-        self.learned_normalised = False
+        self._predictor_built: dict[str, Any] = {}
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -116,7 +111,6 @@ class LearnedPermissibilityMixin(SettingsMixin):
         with th.random.fork_rng(devices=[]):
             th.default_generator.manual_seed(int(make_rng(self.seed, "predictor").integers(2**31)))
             self.predictor = self._make_predictor().to(self.device)
-        self._check_normalisation()
 
     def _make_replay_buffer(self) -> KnowledgeMixin:
         buffer_class = guided_buffer_class(self.replay_buffer_class, self.observation_space, self.n_steps)
@@ -169,7 +163,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
             raise TypeError(
                 f"`predictor_kwargs` holds {name!r}, but PermissibilityPredictor takes {', '.join(list(known)[2:])}."
             )
-        built = {name: str(arguments.get(name, known[name].default)) for name in BUILT}
+        built = {name: described(arguments.get(name, known[name].default)) for name in BUILT}
         changed = [name for name in BUILT if self._predictor_built.get(name, built[name]) != built[name]]
         if changed:
             raise ValueError(
@@ -191,11 +185,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
             if not isinstance(callback, (list, BaseCallback)):
                 callback = ConvertCallback(callback)
             callback = [PermissibilityCallback(), *(callback if isinstance(callback, list) else [callback])]
-        callback = super()._init_callback(callback, progress_bar)
-        for one in every_callback(callback):
-            if any(shares_environment(cast(VecEnv, self.env), value) for value in vars(one).values()):
-                self._warn_of_shared_environment(f"{type(one).__name__}")
-        return callback
+        return super()._init_callback(callback, progress_bar)
 
     def _setup_learn(
         self,
@@ -207,32 +197,12 @@ class LearnedPermissibilityMixin(SettingsMixin):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self._steps_of_earlier_learns += self.num_timesteps
-        normalize = self._vec_normalize_env
-        self.learned_normalised = normalize is not None and normalize.norm_obs
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     @property
     def life_steps(self) -> int:
         """Steps taken over the model's whole life."""
         return self._steps_of_earlier_learns + self.num_timesteps
-
-    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """SB3's ``collect_rollouts``, which keeps last observations as they were and notices foreign steps."""
-        before = self.num_timesteps
-        with watched_steps(env, self._vec_normalize_env) as calls:
-            rollout = super().collect_rollouts(env, *args, **kwargs)
-        if calls[0] > (self.num_timesteps - before) // self.n_envs:
-            self._warn_of_shared_environment("a callback")
-        return rollout
-
-    def _warn_of_shared_environment(self, who: str) -> None:
-        if not self._warned_of_sharing:
-            self._warned_of_sharing = True
-            warnings.warn(
-                f"The training environment is also used by {who}, and stepping or resetting it there leaves "
-                "transitions that never happened in both buffers: evaluate in an environment of its own.",
-                stacklevel=2,
-            )
 
     def refits_due(self, before: int, now: int) -> int:
         """How many fits belong to the steps after ``before``, up to ``now``."""
@@ -254,27 +224,7 @@ class LearnedPermissibilityMixin(SettingsMixin):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        self._check_normalisation()
-        if isinstance(self.replay_buffer, KnowledgeMixin):
-            self._connect(self.replay_buffer)
-
-    def _check_normalisation(self) -> None:
-        """Warns of an environment whose observations are not those that a loaded model learned from."""
-        if not self.learned_normalised or self.env is None:
-            return
-        normalize = self._vec_normalize_env
-        if normalize is None or not normalize.norm_obs:
-            warnings.warn(
-                "This model learned from normalised observations, but its environment gives raw ones, with which it "
-                "acts at random: wrap it in VecNormalize.load(statistics, env), with the statistics of the training.",
-                stacklevel=2,
-            )
-        elif never_updated(normalize):
-            warnings.warn(
-                "This model learned from normalised observations, but the statistics of this VecNormalize are those of "
-                "no observation at all: load them with VecNormalize.load(statistics, env).",
-                stacklevel=2,
-            )
+        self._connect(cast(KnowledgeMixin, self.replay_buffer))
 
     # ---------------------------------------------------------------- saving
 
@@ -306,7 +256,8 @@ class LearnedPermissibilityMixin(SettingsMixin):
         optimizer = self.predictor.optimizer
         own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
         for group in load_path_or_dict.get("predictor.optimizer", {"param_groups": []})["param_groups"]:
-            if group.keys() - {"params"} != own[0].keys():
+            saved = group.keys() - {"params"}
+            if saved - own[0].keys() and own[0].keys() - saved:  # one alone is another version of torch
                 raise TypeError(
                     f"These parameters hold the state of another optimizer than the predictor's "
                     f"{type(optimizer).__name__}: build the model with the `predictor_kwargs` of the saved one."
@@ -321,26 +272,19 @@ class LearnedPermissibilityMixin(SettingsMixin):
         super().load_replay_buffer(path, truncate_last_traj)
         loaded: Any = self.replay_buffer
         try:
-            self._check_loaded(loaded)
+            check_fits(loaded, self)
         except (TypeError, ValueError):
             self.replay_buffer = own
             raise
         self._connect(loaded)
 
-    def _check_loaded(self, loaded: Any) -> None:
-        if not isinstance(loaded, KnowledgeMixin):
-            raise TypeError(
-                f"The file holds a plain {type(loaded).__name__} without a knowledge buffer: "
-                f"load one saved by {type(self).__name__}."
-            )
-        if loaded.n_envs != self.n_envs:
-            raise ValueError(
-                f"The file holds a replay buffer of {loaded.n_envs} environments, but this model has {self.n_envs}: "
-                "load the model with as many environments, or go on with an empty buffer."
-            )
-        for name in ("observation_space", "action_space"):
-            if getattr(loaded, name) != getattr(self, name):
-                raise ValueError(
-                    f"The file holds a replay buffer whose {name} is {getattr(loaded, name)}, but this model's is "
-                    f"{getattr(self, name)}: load one that was saved in the same environment."
-                )
+
+def described(value: Any) -> Any:
+    """An argument of a network in words and numbers, which stay the same when a model is saved and loaded."""
+    if isinstance(value, Mapping):
+        return {str(key): described(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [described(inner) for inner in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return getattr(value, "__qualname__", type(value).__qualname__)

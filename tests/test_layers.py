@@ -28,7 +28,9 @@ FLOORS = (
         "actor_loss",
         "candidates",
         "prediction",
+        "watching",
     },
+    {"action_spaces", "vec_envs"},
     {"permissibility", "generators", "files", "errors", "advice", "tensorboard"},
 )
 ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}

@@ -8,6 +8,7 @@ import stable_baselines3
 import torch as th
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import set_random_seed
 from toy import ALGORITHMS, CONSTRAINED, DISCRETE, GUIDED, Line, build, nearby, towards_centre
 
@@ -348,3 +349,31 @@ def test_load_applies_other_n_steps(tmp_path, n_steps):
     build(DDPGAP, n_steps=n_steps[0]).learn(20).save(tmp_path / "model")
     loaded = DDPGAP.load(tmp_path / "model", env=Line(), n_steps=n_steps[1]).learn(20)
     assert getattr(loaded.replay_buffer, "n_steps", 1) == n_steps[1]
+
+
+class Activated(FlattenExtractor):
+    def __init__(self, space, activation):
+        super().__init__(space)
+        self.activation = activation
+
+    def forward(self, observations):
+        return self.activation(super().forward(observations))
+
+
+def test_a_network_whose_arguments_are_functions_loads_as_it_was_saved(tmp_path):
+    arguments = {"features_extractor_class": Activated, "features_extractor_kwargs": {"activation": lambda x: x.tanh()}}
+    model = build(DDPGAP, policy_kwargs={"net_arch": [8], **arguments}).learn(30)
+    model.save(tmp_path / "model")
+    DDPGAP.load(tmp_path / "model", env=Line()).learn(20)
+    DDPGAP.load(tmp_path / "model", predictor_kwargs={"net_arch": (8,), "optimizer_class": th.optim.Adam})
+
+
+def test_a_file_of_another_version_of_torch_still_loads():
+    model = build(DDPGAP).learn(60)
+    for key in ("decoupled_weight_decay", "a setting of tomorrow"):
+        parameters = model.get_parameters()
+        [group] = parameters["predictor.optimizer"]["param_groups"]
+        if group.pop(key, None) is None:
+            group[key] = None
+        model.set_parameters(parameters)
+        model.learn(10)

@@ -71,12 +71,17 @@ def plot_permissibility(
             "train it first, until K holds `min_per_class` examples of each class."
         )
     key, index = variable if isinstance(variable, tuple) else ("", variable)
-    space = model.observation_space[key] if key else model.observation_space
+    whole = model.observation_space
+    space = dict(whole).get(key) if isinstance(whole, spaces.Dict) else None if key else whole
     n_actions = int(np.prod(model.action_space.shape or (1,)))
-    if isinstance(space, spaces.Dict) or not (0 <= index < np.prod(space.shape) and 0 <= action < n_actions):
+    if (
+        not isinstance(space, spaces.Box)
+        or index not in range(int(np.prod(space.shape)))
+        or action not in range(n_actions)
+    ):
         raise ValueError(
-            f"`variable` = {variable!r}, `action` = {action}: there is no such variable in {model.observation_space} "
-            f"or no such action in {model.action_space}."
+            f"`variable` = {variable!r}, `action` = {action!r}: there is no such variable of a Box in "
+            f"{model.observation_space} or no such action in {model.action_space}."
         )
     seen = _seen(model)
     if limits is None:

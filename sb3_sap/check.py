@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import gymnasium as gym
@@ -77,12 +78,14 @@ def check_permissibility(
     """
     if not isinstance(env, gym.Env):
         raise TypeError(f"`env` must be a single Gymnasium environment, but is {env!r}.")
-    if n_steps < 100:
-        raise ValueError(f"`n_steps` must be at least 100, but is {n_steps}.")
+    given: list[tuple[str, Any, int]] = [("n_steps", n_steps, 100), ("seed", seed, 0)]
+    for name, value, least in given:
+        if not isinstance(value, Integral) or value < least:
+            raise ValueError(f"`{name}` must be a whole number of at least {least}, but is {value!r}.")
     check_action_space("check_permissibility", env.action_space, discrete=None)
     check_observation_space("check_permissibility", env.observation_space)
     function = None if ap_function is None else resolve(ap_function, "ap_function")
-    act = None if policy is None else _acting(policy)
+    act = None if policy is None else _acting(policy, env.action_space)
     env.action_space.seed(seed)
     walk = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)
     labels = label(walk, function)
@@ -106,9 +109,15 @@ def check_permissibility(
     return report
 
 
-def _acting(policy: Any) -> Callable[[Any], Any]:
-    if hasattr(policy, "predict"):
-        return lambda obs: policy.predict(obs, deterministic=True)[0]
-    if not callable(policy):
+def _acting(policy: Any, space: gym.Space[Any]) -> Callable[[Any], Any]:
+    if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(f"`policy` must have SB3's `predict` or be a function (obs) -> action, but is {policy!r}.")
-    return policy  # type: ignore[no-any-return]
+
+    def act(obs: Any) -> Any:
+        action = policy.predict(obs, deterministic=True)[0] if hasattr(policy, "predict") else policy(obs)
+        numbers = np.asarray(action)
+        if numbers.dtype.kind not in "biuf" or numbers.shape != space.shape:
+            raise ValueError(f"`policy` must return one action of {space} for one observation, but gave {action!r}.")
+        return action
+
+    return act

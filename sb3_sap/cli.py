@@ -13,7 +13,7 @@ from rich.console import Console
 from sb3_sap import __version__, zoo
 from sb3_sap.benchmark.cli import add_benchmark
 from sb3_sap.envs.torcs.cli import add_torcs
-from sb3_sap.errors import positive, run_command
+from sb3_sap.errors import not_negative, positive, run_command
 from sb3_sap.evaluation import ENVIRONMENTS
 from sb3_sap.hub import add_push_to_hub
 from sb3_sap.normalisation import NormalisedPolicy, add_vecnormalize
@@ -71,7 +71,7 @@ def _add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
     )
     command.add_argument("--steps", type=positive, default=default.steps, help="training steps")
-    command.add_argument("--seed", type=int, default=default.seed, help="seed of everything random")
+    command.add_argument("--seed", type=not_negative, default=default.seed, help="seed of everything random")
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
     _add_simulator(command)
     command.add_argument("--out", type=Path, default=default.out, help="output folder")

@@ -153,9 +153,11 @@ class ConstrainedExplorationMixin(SettingsMixin):
         if self._constraint is not None:
             for i, previous in enumerate(self._previous):
                 if previous is not None:
-                    interval = self._constraint(rows_of(self._raw_last_obs(), i), *previous)
+                    interval = _ask_interval(
+                        self._constraint, low[i].shape, rows_of(self._raw_last_obs(), i), *previous
+                    )
                     # An interval may reach beyond the action space; what counts is the part inside.
-                    low[i], high[i] = (np.clip(self.policy.scale_action(np.asarray(b)), -1, 1) for b in interval)
+                    low[i], high[i] = (np.clip(self.policy.scale_action(bound), -1, 1) for bound in interval)
                     if not (low[i] <= high[i]).all():
                         raise ValueError(f"`constraint` must return (low, high) with low <= high, but gave {interval}.")
         return low, high
@@ -180,6 +182,26 @@ class ConstrainedExplorationMixin(SettingsMixin):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_constraint", "_permissible_actions", "_previous"]
+
+
+def _ask_interval(constraint: ActionConstraint, shape: tuple[int, ...], *situation: Any) -> tuple[Any, Any]:
+    """Asks a user's constraint for an interval of actions of this shape, and checks what comes back."""
+    try:
+        answer = constraint(*situation)
+    except Exception as error:
+        raise RuntimeError(
+            f"`constraint` raised {type(error).__name__}: {error}. It is called with (obs, previous_obs, last_action) "
+            f"of one environment; here the action has shape {shape}."
+        ) from error
+    try:
+        low, high = (np.broadcast_to(bound, shape) for bound in answer)
+        if {low.dtype.kind, high.dtype.kind} - set("iuf"):
+            raise TypeError("no numbers")
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`constraint` must return (low, high), each of the action's shape {shape}, but gave {answer!r}."
+        ) from error
+    return low, high
 
 
 def rows_of(obs: Any, rows: Any) -> Any:

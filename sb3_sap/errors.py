@@ -6,6 +6,7 @@ import argparse
 import difflib
 import sys
 from collections.abc import Callable, Iterable
+from numbers import Real
 
 from gymnasium.error import Error as EnvironmentProblem
 
@@ -28,6 +29,19 @@ def positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be 1 or more, but is {number}")
     return number
+
+
+def not_negative(text: str) -> int:
+    """A flag's value that must be a whole number of 0 or more."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"must be 0 or more, but is {number}")
+    return number
+
+
+def is_number(value: object) -> bool:
+    """Whether a setting is a real number, whatever its annotation promises."""
+    return isinstance(value, Real)
 
 
 def nearest(value: object, known: Iterable[str]) -> str:

@@ -109,12 +109,13 @@ def write_results(path: Path, results: list[LapResult]) -> None:
         temporary.write_text(json.dumps([asdict(result) for result in results], indent=2) + "\n", encoding="utf-8")
 
 
-def load_policy(path: Path, vecnormalize: Path | None = None) -> BasePolicy | NormalisedPolicy:
+def load_policy(path: str | Path, vecnormalize: str | Path | None = None) -> BasePolicy | NormalisedPolicy:
     """Loads the policy alone from a model file, whichever SB3 algorithm saved it; it takes raw observations.
 
     :param vecnormalize: statistics of SB3's ``VecNormalize``; without them those that lie beside the model, as RL Zoo
         and SB3's ``CheckpointCallback`` leave them, if it learned on normalised observations or does not say
     """
+    path, vecnormalize = Path(path), None if vecnormalize is None else Path(vecnormalize)
     if not path.is_file():
         raise FileNotFoundError(f"There is no model file {path}: give the .zip that `model.save` or the demo wrote.")
     try:

@@ -97,6 +97,9 @@ class ActionPermissibilityMixin(LearnedPermissibilityMixin, ConstrainedExplorati
             )
         if self.teaching_growth is not None:
             check_growth(self, "teaching_growth")
+        coef = self.actor_permissibility_coef
+        if isinstance(coef, Real) and not float(coef) >= 0:
+            raise ValueError(f"`actor_permissibility_coef` must be at least 0, but is {coef!r}.")
         if self.candidate_selection not in SELECTIONS:
             raise ValueError(
                 f"`candidate_selection` must be one of {', '.join(map(repr, SELECTIONS))}, but is "

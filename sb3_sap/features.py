@@ -48,8 +48,10 @@ class RescaleExtractor(FlattenExtractor):
         return super().forward((observations - self.shift) / self.scale)
 
 
-def with_extractor(policy_kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
+def with_extractor(policy_kwargs: Any) -> dict[str, Any]:
     """A copy of ``policy_kwargs`` in which a features extractor may be named, as in YAML."""
+    if policy_kwargs is not None and not isinstance(policy_kwargs, Mapping):
+        raise TypeError(f"`policy_kwargs` and `predictor_kwargs` must be dictionaries, but one is {policy_kwargs!r}.")
     arguments = dict(policy_kwargs or {})
     name = "features_extractor_class"
     if name in arguments:

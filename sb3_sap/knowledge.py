@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_sap.errors import is_number
 from sb3_sap.generators import make_rng
 from sb3_sap.permissibility import FloatArray, Observations
 
@@ -97,8 +98,8 @@ class KnowledgeBuffer:
         seed: int | None = None,
         min_per_class: int = 1,
     ):
-        if not 0 < validation_fraction < 1:
-            raise ValueError(f"`validation_fraction` must lie between 0 and 1, but is {validation_fraction}.")
+        if not (is_number(validation_fraction) and 0 < validation_fraction < 1):
+            raise ValueError(f"`validation_fraction` must lie between 0 and 1, but is {validation_fraction!r}.")
         n_validation = round(size * validation_fraction)
         if min(n_validation, size - n_validation) < 2:
             raise ValueError(

@@ -35,6 +35,8 @@ def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window:
         several of them, of runs with different seeds: then their mean is drawn, and each of them faintly
     :param window: episodes of the moving average
     """
+    if not runs:
+        raise ValueError("`runs` is empty: give a name and what `Monitor` wrote, {name: folder}.")
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
     for number, (name, folders) in enumerate(runs.items()):

@@ -22,6 +22,8 @@ class GuidedPolicy:
     """
 
     def __init__(self, model: ActionPermissibilityMixin):
+        if not hasattr(model, "predictor"):
+            raise TypeError(f"`model` must be a guided model, such as a TQCAP, but is a {type(model).__name__}.")
         self.model = model
 
     def predict(

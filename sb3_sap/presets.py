@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from sb3_sap.errors import nearest
+from sb3_sap.errors import is_number, nearest
 
 #: Keys of RL Zoo's format that tell its runner, not the algorithm's constructor, what to do.
 RUNNER_KEYS = frozenset(
@@ -76,6 +76,8 @@ def preset(name: str, algo: str | type | None = None, steps: int | None = None) 
         algo = "ddpg_ap"
     algo = _zoo_name(algo)
     _check("name", name, preset_names(algo))
+    if not (steps is None or is_number(steps)):
+        raise TypeError(f"`steps` must be a number of training steps, but is {steps!r}.")
     entries = load_config(algo)
     short = f"{name}-3k"
     entry = entries[short if steps is not None and steps <= SHORT_RUN and short in entries else name]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 
+import numpy as np
 from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
 from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.dynamics import BicycleVehicle
@@ -61,9 +62,9 @@ class HighwaySimulator:
     def __init__(
         self, track: str | os.PathLike[str] | Track = "wheel-2", speed: float = 50.0, control_step: float = 0.2
     ) -> None:
-        if not MIN_SPEED <= speed <= MAX_SPEED:
+        if not (isinstance(speed, (int, float, np.number)) and MIN_SPEED <= speed <= MAX_SPEED):
             raise ValueError(f"speed must lie in [{MIN_SPEED:g}, {MAX_SPEED:g}] km/h, got {speed!r}.")
-        if not (math.isfinite(control_step) and control_step > 0):
+        if not (isinstance(control_step, (int, float, np.number)) and math.isfinite(control_step) and control_step > 0):
             raise ValueError(f"control_step must be a positive number of seconds, got {control_step!r}.")
         self.track = get_track(track)
         self.length = self.track.length

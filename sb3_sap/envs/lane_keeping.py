@@ -156,7 +156,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
     ) -> None:
         if laps is not None and (isinstance(laps, bool) or not isinstance(laps, (int, np.integer)) or laps < 1):
             raise ValueError(f"laps must be a positive whole number, or None to drive on, got {laps!r}.")
-        if not math.isfinite(off_track_reward):
+        if not (isinstance(off_track_reward, (int, float, np.number)) and math.isfinite(off_track_reward)):
             raise ValueError(f"off_track_reward must be a number, got {off_track_reward!r}.")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode!r}.")
@@ -196,7 +196,10 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Steer for one control step and return observation (5,), reward, terminated, truncated and ``info``."""
-        controls = np.asarray(action, dtype=np.float64).reshape(self.action_space.shape).tolist()
+        try:
+            controls = np.asarray(action, dtype=np.float64).reshape(self.action_space.shape).tolist()
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"action must be of {self.action_space}, got {action!r}.") from error
         if any(map(math.isnan, controls)):
             raise ValueError(f"action must be numbers in [-1, 1], got {controls}.")
         if not self._on_road:

@@ -50,7 +50,7 @@ def check_file(path: str) -> None:
     if file.suffix not in (".yml", ".yaml"):
         return  # Python, which checks itself
     if not file.is_file():
-        raise FileNotFoundError(f"There is no configuration file {path}.")
+        raise FileNotFoundError(f"There is no configuration file {path}: give one with `-conf`.")
     try:
         entries = yaml.safe_load(file.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:

@@ -164,7 +164,9 @@ def _conditions(path: Path, name: str) -> dict[str, Any]:
         conditions = json.loads(path.read_text(encoding="utf-8"))
         return {"common": conditions["common"], "trace": conditions["traces"][name]}
     except OSError as error:
-        raise ValueError(f"There are no start conditions {path}: {error.strerror}.") from error
+        raise ValueError(
+            f"There are no start conditions {path} ({error.strerror}): give their JSON file with `--start`."
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} must be JSON with `common` and an entry `traces.{name}`, named like the trace file: {error!r}."

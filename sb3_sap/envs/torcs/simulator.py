@@ -7,6 +7,8 @@ import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import numpy as np
+
 from sb3_sap.envs.lane_keeping import CarState
 from sb3_sap.envs.torcs.simulation import TICK, Simulation
 from sb3_sap.envs.torcs.throttle import KMH, PERIOD_TICKS, SpeedHolder
@@ -39,9 +41,13 @@ class TorcsSimulator:
     ):
         if start not in STARTS:
             raise ValueError(f"start must be one of {', '.join(map(repr, STARTS))}, got {start!r}.")
-        if not 0 < speed <= 300:
+        if not (isinstance(speed, (int, float, np.number)) and 0 < speed <= 300):
             raise ValueError(f"speed must lie above 0 and not above 300 km/h, got {speed!r}.")
-        ticks = round(control_step / TICK) if 0 < control_step < math.inf else 0
+        ticks = (
+            round(control_step / TICK)
+            if isinstance(control_step, (int, float, np.number)) and 0 < control_step < math.inf
+            else 0
+        )
         if ticks < 1 or abs(ticks * TICK - control_step) > 1e-9:
             raise ValueError(f"control_step must be a positive multiple of {TICK} s, got {control_step!r}.")
         self.simulation = Simulation(track, car)

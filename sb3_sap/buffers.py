@@ -146,6 +146,18 @@ def check_fits(loaded: ReplayBuffer, model: Any) -> None:
             f"The file holds a replay buffer of {loaded.n_envs} environments, but this model has {model.n_envs}: "
             "load the model with as many environments, or go on with an empty buffer."
         )
+    own = model.replay_buffer
+    for name in ("n_steps", "gamma"):
+        if getattr(loaded, name, None) != getattr(own, name, None):
+            raise ValueError(
+                f"The file holds a replay buffer with {name} = {getattr(loaded, name, None)}, but this model's has "
+                f"{getattr(own, name, None)}: load the model with the `n_steps` and `gamma` of the buffer."
+            )
+    if isinstance(loaded, HerReplayBuffer) != isinstance(own, HerReplayBuffer):
+        raise ValueError(
+            f"The file holds a {type(loaded).__name__}, but this model uses a {type(own).__name__}: load the model "
+            "with the `replay_buffer_class` of the buffer."
+        )
     for name in ("observation_space", "action_space"):
         if getattr(loaded, name) != getattr(model, name):
             raise ValueError(

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.candidates import candidate_actions, choose
 from sb3_sap.generators import make_rng
-from sb3_sap.permissibility import BoolArray, FloatArray, Observations, ask, resolve
+from sb3_sap.permissibility import BoolArray, FloatArray, Observations, ask, copy_observation, resolve
 from sb3_sap.settings import SettingsMixin, check_at_least
 from sb3_sap.vec_envs import environment_layout
 
@@ -187,7 +187,7 @@ class ConstrainedExplorationMixin(SettingsMixin):
 def _ask_interval(constraint: ActionConstraint, shape: tuple[int, ...], *situation: Any) -> tuple[Any, Any]:
     """Asks a user's constraint for an interval of actions of this shape, and checks what comes back."""
     try:
-        answer = constraint(*situation)
+        answer = constraint(*map(copy_observation, situation))
     except Exception as error:
         raise RuntimeError(
             f"`constraint` raised {type(error).__name__}: {error}. It is called with (obs, previous_obs, last_action) "

@@ -197,6 +197,7 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self._steps_of_earlier_learns += self.num_timesteps
+        self._connect(cast(KnowledgeMixin, self.replay_buffer))  # a copied model's buffer has lost its function
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     @property
@@ -270,13 +271,10 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         own = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded: Any = self.replay_buffer
-        try:
-            check_fits(loaded, self)
-        except (TypeError, ValueError):
-            self.replay_buffer = own
-            raise
-        self._connect(loaded)
+        loaded, self.replay_buffer = self.replay_buffer, own
+        check_fits(cast(Any, loaded), self)
+        self.replay_buffer = loaded
+        self._connect(cast(KnowledgeMixin, loaded))
 
 
 def described(value: Any) -> Any:

@@ -61,7 +61,7 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def copy_observation(obs: Any) -> Any:
-    """A copy of one observation: an environment may reuse its array, and a label needs the one before the step."""
+    """A copy of an observation or a batch: an environment may reuse its array, a user's function may write to it."""
     return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
 
 
@@ -101,7 +101,8 @@ def ask(
     name = getattr(function, "__name__", repr(function))
     n = len(actions)
     try:
-        labels = np.asarray(function(obs, actions, *next_obs))
+        # Copies, because a function that works in place would change what is stored and executed.
+        labels = np.asarray(function(*map(copy_observation, (obs, actions, *next_obs))))
     except Exception as error:
         batches = "(obs, actions, next_obs)" if next_obs else "(obs, actions)"
         raise RuntimeError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,7 @@ class PermissibilityPredictor(BaseModel):
                     f"`optimizer_class` = {optimizer_class!r} names no optimizer of torch.optim, such as 'Adam'."
                 )
             optimizer_class = found
+        _check_arguments(net_arch, batch_size, learning_rate)
         super().__init__(
             observation_space,
             action_space,
@@ -187,6 +189,15 @@ class PermissibilityPredictor(BaseModel):
         obs: Any = obs_as_tensor(dataset.observations, self.device)
         actions, labels = (th.as_tensor(array, device=self.device) for array in dataset[1:])
         return obs, actions, labels
+
+
+def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None:
+    if not isinstance(net_arch, (list, tuple)) or not all(isinstance(n, Integral) and int(n) > 0 for n in net_arch):
+        raise ValueError(f"`net_arch` must be a list of the widths of hidden layers, but is {net_arch!r}.")
+    if not (isinstance(batch_size, Integral) and int(batch_size) > 0):
+        raise ValueError(f"`batch_size` must be a whole number of at least 1, but is {batch_size!r}.")
+    if not (isinstance(learning_rate, Real) and float(learning_rate) >= 0):
+        raise ValueError(f"`learning_rate` of the predictor must be a number of at least 0, but is {learning_rate!r}.")
 
 
 def candidate_logits(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import re
 import warnings
@@ -104,6 +105,11 @@ class SettingsMixin(OffPolicyAlgorithm):
         action_noise: Any = self.action_noise
         if isinstance(action_noise, Mapping):
             self.action_noise = make_action_noise(action_noise, self.action_space)
+        elif action_noise is not None and not isinstance(action_noise, ActionNoise):
+            raise TypeError(
+                f"`action_noise` must be an ActionNoise of SB3's or its description, such as "
+                f'{{"type": "normal", "sigma": 0.1}}, but is {action_noise!r}.'
+            )
         elif isinstance(action_noise, VectorizedActionNoise) and action_noise.n_envs != self.n_envs:
             # Saved with other environments: SB3 makes one for these when it learns.
             self.action_noise = action_noise.base_noise
@@ -161,6 +167,8 @@ class SettingsMixin(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> Self:
         """SB3's ``learn``; without arguments it runs the paper's 15,000 steps."""
+        if self.env is None:
+            raise ValueError("This model has no environment to learn in: load it with one, or call `set_env` first.")
         return super().learn(
             total_timesteps,
             callback,
@@ -182,6 +190,10 @@ class SettingsMixin(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> Self:
         """SB3's ``load``, which says so when a file was cut short, and heeds a new ``seed``."""
+        known = inspect.signature(cls).parameters
+        for name in kwargs.keys() - known.keys():
+            if near := difflib.get_close_matches(name, known, n=1, cutoff=0.75):
+                raise TypeError(f"`load` was given the unknown setting `{name}`: did you mean `{near[0]}`?")
         try:
             model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except AssertionError as error:
@@ -190,6 +202,11 @@ class SettingsMixin(OffPolicyAlgorithm):
                 raise
             raise ValueError(
                 f"The file {path} holds no whole model: was it cut short, or not written by save?"
+            ) from error
+        except (KeyError, AttributeError) as error:
+            raise ValueError(
+                f"The file {path} holds no model that {cls.__name__} can take over ({error}): load it with "
+                "the class that saved it."
             ) from error
         if kwargs.get("seed") is not None:
             model.set_random_seed(kwargs["seed"])  # in place of the generators that the file holds

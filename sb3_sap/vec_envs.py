@@ -131,7 +131,7 @@ def watched_steps(env: VecEnv, normalize: VecNormalize | None) -> Iterator[list[
     :param normalize: its VecNormalize, if there is one
     :return: a list whose only entry is the number of steps and resets so far, whoever asked for them
     """
-    inner = unwrapped(env) if normalize is None else normalize.venv
+    inner = env if normalize is None else normalize.venv
     calls = [0]
     step_wait, reset = inner.step_wait, inner.reset
 

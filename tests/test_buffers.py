@@ -1,3 +1,4 @@
+import copy
 import io
 import pickle
 
@@ -11,6 +12,8 @@ from toy import Line, build, towards_centre
 
 from sb3_sap import (
     DDPGAP,
+    DQNAP,
+    SACAP,
     KnowledgeBuffer,
     KnowledgeMixin,
     PermissibilityDictReplayBuffer,
@@ -223,3 +226,58 @@ def test_own_buffer_class_gets_knowledge():
     assert type(model.replay_buffer) is Mine
     assert isinstance(model.replay_buffer.knowledge, KnowledgeBuffer)
     assert len(model.replay_buffer.knowledge) == 15
+
+
+@pytest.mark.parametrize("algorithm", [SACAP, DQNAP])
+def test_functions_that_work_in_place_change_nothing_that_is_stored_or_executed(algorithm):
+    def label(obs, actions, next_obs):
+        good = towards_centre(obs, actions, next_obs)
+        for array in (obs, actions, next_obs):
+            array *= 0
+        return good
+
+    def allow(obs, actions):
+        good = np.ones(len(actions), bool)
+        obs *= 0
+        actions *= 0
+        return good
+
+    env = Line(n_actions=3 if algorithm is DQNAP else None)
+    settings = {"learning_starts": 1000}
+    model = build(algorithm, env, ap_function=label, permissible_actions=allow, **settings).learn(40)
+    plain = build(algorithm, Line(n_actions=3 if algorithm is DQNAP else None), **settings).learn(40)
+    assert k_rows(model.replay_buffer.knowledge) == r_rows(plain.replay_buffer, 40)
+    np.testing.assert_array_equal(model.replay_buffer.actions, plain.replay_buffer.actions)
+
+
+def test_a_copied_model_goes_on_with_its_ap_function():
+    model = build(DDPGAP, Line(labels=False), ap_function=towards_centre).learn(20)
+    copied = copy.deepcopy(model).learn(20)
+    assert len(copied.replay_buffer.knowledge) == 40
+
+
+@pytest.mark.parametrize(
+    ("saved", "own", "message"),
+    [
+        ({"n_steps": 3}, {}, "with n_steps = 3, but this model's has None"),
+        ({}, {"n_steps": 3}, "with n_steps = None, but this model's has 3"),
+        ({"n_steps": 3}, {"n_steps": 3, "gamma": 0.5}, "with gamma = 0.99, but this model's has 0.5"),
+    ],
+)
+def test_loading_a_buffer_of_other_returns_is_refused(saved, own, message):
+    file = io.BytesIO()
+    build(DDPGAP, **saved).learn(20).save_replay_buffer(file)
+    file.seek(0)
+    with pytest.raises(ValueError, match=f"^The file holds a replay buffer {message}"):
+        build(DDPGAP, **own).load_replay_buffer(file)
+
+
+def test_loading_a_buffer_without_hindsight_is_refused():
+    goal = {"env": Line("goal"), "policy": "MultiInputPolicy", "learning_starts": 30}
+    file = io.BytesIO()
+    build(DDPGAP, **goal).learn(20).save_replay_buffer(file)
+    file.seek(0)
+    with pytest.raises(
+        ValueError, match="^The file holds a PermissibilityDictReplayBuffer, but this model uses a Perm"
+    ):
+        build(DDPGAP, **goal, replay_buffer_class=HerReplayBuffer).load_replay_buffer(file)

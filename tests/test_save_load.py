@@ -377,3 +377,21 @@ def test_a_file_of_another_version_of_torch_still_loads():
             group[key] = None
         model.set_parameters(parameters)
         model.learn(10)
+
+
+@pytest.mark.parametrize(
+    ("act", "error", "sentence"),
+    [
+        (
+            lambda path: SACAP.load(path),
+            ValueError,
+            "holds no model that SACAP can take over .* the class that saved it",
+        ),
+        (lambda path: DDPGAP.load(path, alhpa=0.1), TypeError, "unknown setting `alhpa`: did you mean `alpha`"),
+        (lambda path: DDPGAP.load(path).learn(10), ValueError, "This model has no environment to learn in"),
+    ],
+)
+def test_mistakes_with_saved_models(tmp_path, act, error, sentence):
+    build(DDPGAP).learn(20).save(tmp_path / "model")
+    with pytest.raises(error, match=sentence):
+        act(tmp_path / "model")

@@ -15,6 +15,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
+    VecEnvWrapper,
     VecFrameStack,
     VecNormalize,
     VecTransposeImage,
@@ -331,6 +332,25 @@ def test_evaluating_in_another_environment_does_not_warn():
     callback = EvalCallback(DummyVecEnv([Line]), eval_freq=10, verbose=0, warn=False)
     model = build(DDPGAP, env).learn(40, callback=callback)
     model.learn(7, callback=lambda *_: False)  # stopped amid a step
+
+
+class Skips(VecEnvWrapper):
+    """Every action is executed twice."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        actions = self.venv.actions
+        self.venv.step_wait()
+        self.venv.step_async(actions)
+        return self.venv.step_wait()
+
+
+@pytest.mark.filterwarnings("error:The training environment")
+@pytest.mark.parametrize("wrap", [Skips, lambda env: VecNormalize(Skips(env))])
+def test_a_wrapper_that_steps_twice_is_nobody_else(wrap):
+    build(DDPGAP, wrap(DummyVecEnv([Line]))).learn(40)
 
 
 # ---------------------------------------------------------------- models that learned from normalised observations

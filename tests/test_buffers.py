@@ -277,7 +277,5 @@ def test_loading_a_buffer_without_hindsight_is_refused():
     file = io.BytesIO()
     build(DDPGAP, **goal).learn(20).save_replay_buffer(file)
     file.seek(0)
-    with pytest.raises(
-        ValueError, match="^The file holds a PermissibilityDictReplayBuffer, but this model uses a Perm"
-    ):
+    with pytest.raises(ValueError, match=r"^The file holds a PermissibilityDictReplayBuffer, but .* uses a Perm"):
         build(DDPGAP, **goal, replay_buffer_class=HerReplayBuffer).load_replay_buffer(file)

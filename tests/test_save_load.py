@@ -385,7 +385,7 @@ def test_a_file_of_another_version_of_torch_still_loads():
         (
             lambda path: SACAP.load(path),
             ValueError,
-            "holds no model that SACAP can take over .* the class that saved it",
+            "no model that SACAP can take over .* the class that saved it",
         ),
         (lambda path: DDPGAP.load(path, alhpa=0.1), TypeError, "unknown setting `alhpa`: did you mean `alpha`"),
         (lambda path: DDPGAP.load(path).learn(10), ValueError, "This model has no environment to learn in"),

@@ -106,6 +106,23 @@ def _as_dtype(values: Any, dtype: Any) -> Any:
     return (np.rint(values) if np.issubdtype(dtype, np.integer) else values).astype(dtype)
 
 
+def is_at(env: VecEnv, normalize: VecNormalize | None, obs: Any, raw_obs: Any) -> bool:
+    """Whether environments are, as far as can be seen, still where a model left them.
+
+    :param obs: the last observations that the model saw
+    :param raw_obs: the same before VecNormalize
+    """
+    if normalize is not None:
+        return _equal(normalize.get_original_obs(), raw_obs)
+    return not isinstance(env, DummyVecEnv) or _equal(env._obs_from_buf(), obs)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return all(np.array_equal(one[key], other[key]) for key in one)
+    return np.array_equal(one, other)
+
+
 def shares_environment(env: VecEnv, other: object) -> bool:
     """Whether ``other``, an environment or a vector of them, steps the same environments as ``env``."""
     return bool(_identities(env) & _identities(other))

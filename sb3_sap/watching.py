@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sap.callbacks import every_callback
 from sb3_sap.settings import SettingsMixin
-from sb3_sap.vec_envs import never_updated, shares_environment, watched_steps
+from sb3_sap.vec_envs import is_at, never_updated, shares_environment, watched_steps
 
 
 class WatchedEnvironmentMixin(SettingsMixin):
@@ -42,6 +42,10 @@ class WatchedEnvironmentMixin(SettingsMixin):
         normalize = self._vec_normalize_env
         self.learned_normalised = normalize is not None and normalize.norm_obs
         self._warned_of_sharing = False
+        env = cast(VecEnv, self.env)
+        if self._last_obs is not None and not is_at(env, normalize, self._last_obs, self._last_original_obs):
+            # Evaluated since, for example: without a reset the next transition would begin in another state.
+            self._last_obs = None
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

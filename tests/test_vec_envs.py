@@ -334,6 +334,18 @@ def test_evaluating_in_another_environment_does_not_warn():
     model.learn(7, callback=lambda *_: False)  # stopped amid a step
 
 
+@pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize], ids=["plain", "VecNormalize"])
+@pytest.mark.parametrize("keyed", [False, True])
+def test_learning_goes_on_right_after_an_evaluation_in_the_same_environment(wrap, keyed):
+    policy = "MultiInputPolicy" if keyed else "MlpPolicy"
+    model = build(DDPGAP, wrap(vec(2, keyed=keyed)), policy=policy, ap_function=went_up).learn(12)
+    model.learn(12, reset_num_timesteps=False)
+    assert model._episode_num == 2  # of seven steps: nobody was there, so nothing was reset
+    evaluate_policy(model, model.get_env(), 1, warn=False)
+    model.learn(40, reset_num_timesteps=False)
+    assert model.replay_buffer.knowledge.seen == [0, 64]
+
+
 class Skips(VecEnvWrapper):
     """Every action is executed twice."""
 

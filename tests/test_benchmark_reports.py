@@ -155,6 +155,7 @@ def files(folder):
     return {path.name for path in folder.iterdir() if path.is_file()}
 
 
+@pytest.mark.slow
 def test_all_reports_of_the_runs_that_there_are(tmp_path, capsys):
     make(tmp_path, ["paper", "linear"])
     assert report(tmp_path) == 0

@@ -54,6 +54,7 @@ def test_every_algorithm_runs(algo, tmp_path):
     assert (out / "evaluation.json").exists()
 
 
+@pytest.mark.slow
 def test_same_seed_same_rows(demo, tmp_path):
     _, *words = shlex.split(json.loads((demo / "run.json").read_text())["command"])
     assert main([*words, "--out", str(tmp_path), "--no-animation"]) == 0

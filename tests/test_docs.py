@@ -171,10 +171,8 @@ NOTEBOOKS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[] if name.startswith("01") else pytest.mark.slow) for name in NOTEBOOKS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_run_and_hold_no_outputs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8")

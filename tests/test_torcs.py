@@ -301,6 +301,7 @@ def test_libraries_are_used_again(torcs):
     assert copies() == before > 0
 
 
+@pytest.mark.slow
 def test_closing_gives_everything_back(torcs):
     def resident_after(times):
         for _ in range(times):

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import Line, build, towards_centre
 
-from sb3_sap import DQNAP, ActionPermissibility, check_permissibility, quick_classifier
+from sb3_sap import DDPGAP, DQNAP, SACAP, ActionPermissibility, check_permissibility, quick_classifier
 from sb3_sap.trials import N_ACTIONS
 
 
@@ -348,3 +348,16 @@ def test_lane_keeping_forbids_good_actions_near_the_axis():
     assert strict.policy_forbidden > 0.1
     assert check(beside, policy=linear).policy_forbidden < strict.policy_forbidden / 2
     assert N_ACTIONS % 2 == 1  # the sweep holds steering straight ahead
+
+
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP])
+def test_actions_without_a_dimension_work_here_as_in_training(algorithm):
+    env = Line(labels=False)
+    env.action_space = spaces.Box(-1, 1, (), np.float32)
+    report = check_permissibility(env, towards_centre, n_steps=200, verbose=False)
+    assert report.action_matters > 0.9
+    assert len(report.action_informs) == 1
+    model = build(algorithm, env, ap_function=towards_centre).learn(60)
+    assert model.predictor.fitted
+    action, _ = model.predict(np.float32([0.5, 0.1]), guided=True)
+    assert action.shape == ()

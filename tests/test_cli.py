@@ -20,7 +20,7 @@ from sb3_sap.hub import EXTRAS
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    assert main(["demo", "--steps", "400", "--out", str(out), "--seed", "101"]) == 0
+    assert main(["demo", "--steps", "200", "--out", str(out), "--seed", "101"]) == 0
     return out
 
 
@@ -28,7 +28,7 @@ def test_demo_leaves_what_it_promises(demo):
     names = {path.name for path in demo.iterdir()}
     pictures = {"learning_curve.png", "predictor.png", "lap.gif"}
     assert names == {"model.zip", "run.json", "training.csv", "evaluation.json"} | pictures
-    assert len(pd.read_csv(demo / "training.csv")) == 400
+    assert len(pd.read_csv(demo / "training.csv")) == 200
     rows = json.loads((demo / "evaluation.json").read_text())
     assert [row["track"] for row in rows] == ["eroad", "spring", "g-track-3", "ole-road-1"]
     assert all(0 <= row["covered"] <= 1 for row in rows)

@@ -26,6 +26,8 @@ from sb3_sap.predictor import PermissibilityPredictor
 from sb3_sap.settings import check_at_least
 from sb3_sap.watching import WatchedEnvironmentMixin
 
+#: What hindsight goals need in an observation.
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 #: Arguments of the predictor that its saved weights and optimizer depend on.
 BUILT = (
     "net_arch",
@@ -119,6 +121,13 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
             kwargs = {"n_steps": self.n_steps, "gamma": self.gamma, **kwargs}
         if issubclass(buffer_class, HerReplayBuffer):
             kwargs["env"] = self.env
+            missing = set(GOAL_KEYS).difference(getattr(self.observation_space, "spaces", {}))
+            if missing:
+                raise ValueError(
+                    f"`replay_buffer_class` = {buffer_class.__name__} needs Dict observations with "
+                    f"{', '.join(GOAL_KEYS)}, but {', '.join(sorted(missing))} is missing in "
+                    f"{self.observation_space}: leave it out, or use an environment with goals."
+                )
         knowledge = KnowledgeBuffer(
             self.observation_space,
             int(np.prod(self.action_space.shape or (1,))),

@@ -81,10 +81,23 @@ class SettingsMixin(OffPolicyAlgorithm):
             env = maybe_make_env(env, kwargs.get("verbose", 0))
             check_action_space(type(self).__name__, env.action_space, self.discrete)
             check_observation_space(type(self).__name__, env.observation_space)
+            if policy == "MultiInputPolicy" and not isinstance(env.observation_space, spaces.Dict):
+                raise ValueError(
+                    f"`policy` 'MultiInputPolicy' is for Dict observations, but these are {env.observation_space}: use "
+                    "'MlpPolicy', or 'CnnPolicy' for images."
+                )
         # SB3 writes into the dictionaries that it is given.
         kwargs["replay_buffer_kwargs"] = dict(kwargs.get("replay_buffer_kwargs") or {})
         kwargs["policy_kwargs"] = with_extractor(kwargs.get("policy_kwargs"))
-        super().__init__(policy, env, *args, **kwargs)
+        try:
+            super().__init__(policy, env, *args, **kwargs)
+        except AssertionError as error:
+            if "NatureCNN" not in str(error):
+                raise
+            raise ValueError(
+                f"`policy` {policy!r} is for images (uint8, from 0 to 255), but the observations are "
+                f"{env.observation_space}: use 'MlpPolicy', or a `features_extractor_class` of your own."
+            ) from error
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
@@ -100,6 +113,7 @@ class SettingsMixin(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         # Here and not in the constructor, which what `load` is given passes by.
+        check_at_least(self, buffer_size=1, batch_size=1, n_steps=1)
         for name in self.schedules:
             setattr(self, name, as_schedule(getattr(self, name), name))
         action_noise: Any = self.action_noise
@@ -250,6 +264,8 @@ def make_action_noise(description: Mapping[str, Any], action_space: spaces.Space
         raise ValueError(f"`action_noise` has type {kind!r}, but must be one of {', '.join(map(repr, NOISES))}.")
     if "sigma" not in settings:
         raise ValueError("`action_noise` needs 'sigma', the scale of the noise in scaled actions (-1 to 1).")
+    if not np.all(np.isreal(settings["sigma"])) or np.any(np.asarray(settings["sigma"]) < 0):
+        raise ValueError(f"`action_noise`: 'sigma' must be a number of at least 0, but is {settings['sigma']!r}.")
     ones = np.ones(action_space.shape or ())
     mean = settings.pop("mean", 0.0) * ones
     try:

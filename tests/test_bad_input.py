@@ -6,6 +6,7 @@ import pytest
 import sb3_contrib
 import stable_baselines3
 from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
 from toy import ALGORITHMS, CONSTRAINED, GUIDED, Line, build
 
 from sb3_sap import (
@@ -291,3 +292,29 @@ def test_the_shift_that_the_sentence_names_works():
 def test_a_mixin_before_an_on_policy_algorithm(mixin, base):
     with pytest.raises(TypeError, match=f"^Mine puts {mixin.__name__} before an on-policy algorithm"):
         type("Mine", (mixin, base), {})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"policy": "MultiInputPolicy"}, "^`policy` 'MultiInputPolicy' is for Dict observations"),
+        ({"policy": "CnnPolicy"}, "^`policy` 'CnnPolicy' is for images"),
+        ({"n_steps": 0}, "^`n_steps` must be a whole number of at least 1"),
+        ({"batch_size": 0}, "^`batch_size` must be a whole number of at least 1"),
+        ({"buffer_size": 0}, "^`buffer_size` must be a whole number of at least 1"),
+        (
+            {"action_noise": {"type": "normal", "sigma": -0.1}},
+            "^`action_noise`: 'sigma' must be a number of at least 0",
+        ),
+        ({"action_noise": {"type": "normal", "sigma": "big"}}, "^`action_noise`: 'sigma' must be a number"),
+        ({"replay_buffer_class": HerReplayBuffer}, "needs Dict observations with .*achieved_goal, .* is missing"),
+        (
+            {"env": Line("dict"), "policy": "MultiInputPolicy", "replay_buffer_class": HerReplayBuffer},
+            "achieved_goal, desired_goal, observation is missing in Dict",
+        ),
+    ],
+    ids=str,
+)
+def test_settings_of_sb3_that_cannot_work(settings, message):
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        build(SACAP, **settings)

@@ -65,6 +65,13 @@ def copy_observation(obs: Any) -> Any:
     return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
 
 
+def same_observation(one: Any, other: Any) -> bool:
+    """Whether two observations, or batches of them, are equal."""
+    if isinstance(one, Mapping):
+        return all(np.array_equal(one[key], other[key]) for key in one)
+    return np.array_equal(one, other)
+
+
 def resolve(function: F | str, argument: str) -> F:
     """Returns ``function``, importing it first when it is a dotted name such as ``"package.module.function"``.
 

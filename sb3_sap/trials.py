@@ -9,7 +9,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_sap.permissibility import APFunction, BoolArray, ask, copy_observation, labels_from_infos
+from sb3_sap.permissibility import (
+    APFunction,
+    BoolArray,
+    ask,
+    copy_observation,
+    labels_from_infos,
+    same_observation,
+)
 
 #: States at which actions are tried: of one action dimension or a finite space, and of several dimensions.
 N_STATES, N_STATES_SEVERAL = 16, 24
@@ -68,7 +75,7 @@ def try_actions(env: gym.Env[Any, Any], function: APFunction | None, seed: int) 
         sweep: list[Transition] = []
         for action in _sweep_actions(space, rng):
             sweep.append(_step_from(env, state, prefix, action))
-            if not _same(sweep[-1].obs, sweep[0].obs):
+            if not same_observation(sweep[-1].obs, sweep[0].obs):
                 return None, None
         labels = label(sweep, function)
         changes.append(int(np.count_nonzero(np.diff(labels))))
@@ -138,9 +145,3 @@ def _step(env: gym.Env[Any, Any], action: Any) -> tuple[Any, bool, dict[str, Any
 def _kind(answer: Any) -> str:
     kinds = ", ".join(type(part).__name__ for part in answer) if isinstance(answer, tuple) else ""
     return f"a tuple of ({kinds})" if kinds else f"one {type(answer).__name__}"
-
-
-def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, dict):
-        return all(np.array_equal(one[key], other[key]) for key in one)
-    return np.array_equal(one, other)

@@ -11,6 +11,8 @@ import numpy as np
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage
 
+from sb3_sap.permissibility import same_observation
+
 #: In a step's ``info``: an episode's last observation as it was before VecNormalize.
 RAW_LAST = "sap_raw_terminal_observation"
 
@@ -113,14 +115,8 @@ def is_at(env: VecEnv, normalize: VecNormalize | None, obs: Any, raw_obs: Any) -
     :param raw_obs: the same before VecNormalize
     """
     if normalize is not None:
-        return _equal(normalize.get_original_obs(), raw_obs)
-    return not isinstance(env, DummyVecEnv) or _equal(env._obs_from_buf(), obs)
-
-
-def _equal(one: Any, other: Any) -> bool:
-    if isinstance(one, dict):
-        return all(np.array_equal(one[key], other[key]) for key in one)
-    return np.array_equal(one, other)
+        return same_observation(normalize.get_original_obs(), raw_obs)
+    return not isinstance(env, DummyVecEnv) or same_observation(env._obs_from_buf(), obs)
 
 
 def shares_environment(env: VecEnv, other: object) -> bool:

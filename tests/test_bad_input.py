@@ -313,7 +313,6 @@ def test_a_mixin_before_an_on_policy_algorithm(mixin, base):
             "achieved_goal, desired_goal, observation is missing in Dict",
         ),
     ],
-    ids=str,
 )
 def test_settings_of_sb3_that_cannot_work(settings, message):
     with pytest.raises(ValueError, match=f"(?s){message}"):

@@ -111,7 +111,7 @@ def guided_buffer_class(
     requested: type[ReplayBuffer] | None, observation_space: spaces.Space[Any], n_steps: int
 ) -> type[KnowledgeMixin]:
     """The buffer class that SB3 would have chosen, or that the user asked for, in the form that feeds K."""
-    # A loaded model remembers the buffer of its n_steps then.
+    # A saved model names the class that its own n_steps led to; `load` may be given others.
     if requested is None or requested is PermissibilityReplayBuffer:
         plain = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
         requested = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else plain

@@ -9,7 +9,7 @@ import time
 import gymnasium as gym
 import numpy as np
 
-from sb3_sap.envs.lane_keeping import STEERING_LOCK  # importing sb3_sap registers the environment
+from sb3_sap.envs.car import STEERING_LOCK
 
 
 def main(track: str = "wheel-2", steps: int = 20_000) -> None:

@@ -22,13 +22,13 @@ import gymnasium as gym
 import pandas as pd
 import torch as th
 
-import sb3_sap.exploration
+import sb3_sap.guidance.mixin
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.columns import Column, parse_column
 from sb3_sap.benchmark.learners import algorithm_class, make_model, settings_of
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
 from sb3_sap.benchmark.provenance import provenance
-from sb3_sap.callbacks import PermissibilityCallback
+from sb3_sap.predictor.callbacks import PermissibilityCallback
 
 PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
@@ -57,9 +57,11 @@ def watch_the_parts() -> None:
     callback: Any = PermissibilityCallback
     callback.fit = timed("fit E", callback.fit)
     callback.validate = timed("validate E", callback.validate)
-    guided: Any = sb3_sap.exploration.ActionPermissibilityMixin
-    guided._guide = timed("Algorithm 1", guided._guide)
-    sb3_sap.exploration.permissible_actor_step = timed("teach the actor", sb3_sap.exploration.permissible_actor_step)
+    guided: Any = sb3_sap.guidance.mixin.ActionPermissibilityMixin
+    guided.guide = timed("Algorithm 1", guided.guide)
+    sb3_sap.guidance.auxiliary_update.permissible_actor_step = timed(
+        "teach the actor", sb3_sap.guidance.auxiliary_update.permissible_actor_step
+    )
 
 
 def build(algo: str, settings: dict):

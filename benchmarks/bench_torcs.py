@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 import sb3_sap  # noqa: F401  # registers the environment
-from sb3_sap.envs.torcs.simulation import TICK
+from sb3_sap.envs.torcs.physics import TICK
 
 STEPS = {0.2: 4_000, 0.02: 40_000}
 TICKS = 100_000

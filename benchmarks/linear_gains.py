@@ -9,7 +9,7 @@ import sys
 from scipy.optimize import minimize
 
 from sb3_sap.benchmark.linear import LinearFeedback
-from sb3_sap.evaluation import lap, lap_env
+from sb3_sap.evaluation.laps import lap, lap_env
 
 ANGLE = (1.0, 2.0, 3.0, 4.0, 6.0)
 TRACK_POS = (-1.0, -2.0, -4.0, -8.0, -16.0)

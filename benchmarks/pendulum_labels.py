@@ -17,7 +17,7 @@ from sb3_sap.benchmark.columns import parse_column
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
 from sb3_sap.benchmark.tasks import planned_steps
-from sb3_sap.evaluation import make_env
+from sb3_sap.evaluation.environments import make_env
 
 TASK = "Pendulum-v1"
 NAMES = ("pendulum_height", "pendulum_torque", "pendulum_energy")

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sap import DDPGAP
 from sb3_sap.benchmark.pages import markdown
-from sb3_sap.files import atomic_path
+from sb3_sap.common.files import atomic_path
 
 STEPS, FROM = 2_000, 500
 FIRST_SEED = 100

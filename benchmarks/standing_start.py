@@ -16,12 +16,13 @@ import numpy as np
 import pandas as pd
 import torch as th
 
-from sb3_sap.beliefs import permissible_probability
 from sb3_sap.benchmark.cells import make_cell
 from sb3_sap.benchmark.columns import parse_column
 from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.pages import markdown, write_csv, write_text
-from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env, make_env
+from sb3_sap.evaluation.environments import make_env
+from sb3_sap.evaluation.laps import ENVIRONMENTS, lap, lap_env
+from sb3_sap.evaluation.predictor_plots import permissible_probability
 
 STEPS, TRACK = 500, "g-track-1"
 LOOK = 10  # control steps of 0.2 s, two seconds

@@ -21,7 +21,7 @@ from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3.common.noise import NormalActionNoise
 
 import sb3_sap  # noqa: F401  # registers the environments
-from sb3_sap.evaluation import drive_lap
+from sb3_sap.evaluation.laps import drive_lap
 
 BASES = {"ddpg": DDPG, "td3": TD3, "sac": SAC, "tqc": TQC, "crossq": CrossQ}
 VALIDATION_TRACKS = ("g-track-1", "aalborg", "e-track-1")

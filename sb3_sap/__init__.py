@@ -14,23 +14,24 @@ from sb3_sap.algorithms import (
     TQCAP,
     CrossQAP,
 )
-from sb3_sap.buffers import (
+from sb3_sap.check.check import check_permissibility
+from sb3_sap.check.report import PermissibilityReport
+from sb3_sap.common.extractors import RescaleExtractor
+from sb3_sap.guidance.action_filter import GuidedPolicy
+from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.permissibility import ActionPermissibility
+from sb3_sap.predictor.buffers import (
     KnowledgeMixin,
     PermissibilityDictReplayBuffer,
     PermissibilityHerReplayBuffer,
     PermissibilityNStepReplayBuffer,
     PermissibilityReplayBuffer,
 )
-from sb3_sap.callbacks import PermissibilityCallback
-from sb3_sap.check import PermissibilityReport, check_permissibility
-from sb3_sap.constraints import ConstrainedExplorationMixin
-from sb3_sap.exploration import ActionPermissibilityMixin
-from sb3_sap.features import RescaleExtractor
-from sb3_sap.knowledge import KnowledgeBuffer
-from sb3_sap.learning import LearnedPermissibilityMixin
-from sb3_sap.permissibility import ActionPermissibility
-from sb3_sap.prediction import GuidedPolicy
-from sb3_sap.predictor import PermissibilityPredictor
+from sb3_sap.predictor.callbacks import PermissibilityCallback
+from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
+from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.presets import preset
 
 __version__ = "0.1.0"

@@ -9,8 +9,9 @@ from stable_baselines3 import DDPG as PlainDDPG
 from stable_baselines3 import DQN, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sap.constraints import ActionConstraint, ConstrainedExplorationMixin
-from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
+from sb3_sap.guidance.constraints import ActionConstraint
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 
 #: The lane-keeping rules of section 5.1, by name: the algorithms know no environment.
 CE1 = "sb3_sap.envs.constraint_ce1"
@@ -18,8 +19,8 @@ CE2 = "sb3_sap.envs.constraint_ce2"
 
 
 class DDPG(ConstrainedExplorationMixin, PlainDDPG):
-    """SB3's DDPG with the settings of :class:`~sb3_sap.settings.SettingsMixin` and
-    :class:`~sb3_sap.constraints.ConstrainedExplorationMixin`; without them equal to the bit.
+    """SB3's DDPG with the settings of :class:`~sb3_sap.common.settings.SettingsMixin` and
+    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`; without them equal to the bit.
     """
 
 
@@ -30,7 +31,7 @@ class DDPGAP(ActionPermissibilityMixin, PlainDDPG):
     Driving", KDD'18 Deep Learning Day.
 
     The parameters are those of SB3's ``DDPG`` and of
-    :class:`~sb3_sap.exploration.ActionPermissibilityMixin`.
+    :class:`~sb3_sap.guidance.mixin.ActionPermissibilityMixin`.
     """
 
 

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeAlias, TypeVar
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 
-#: A batch of observations, (n, *obs_shape), or one such array per key of a ``Dict`` space.
-Observations: TypeAlias = "np.ndarray[Any, Any] | dict[str, np.ndarray[Any, Any]]"
-BoolArray: TypeAlias = "np.ndarray[Any, np.dtype[np.bool_]]"
-FloatArray: TypeAlias = "np.ndarray[Any, np.dtype[np.floating[Any]]]"
-F = TypeVar("F", bound=Callable[..., Any])
+from sb3_sap.common.arrays import BoolArray, Observations, copy_observation
 
 
 class APFunction(Protocol):
@@ -60,46 +55,10 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
         return next_obs, reward, terminated, truncated, info
 
 
-def copy_observation(obs: Any) -> Any:
-    """A copy of an observation or a batch: an environment may reuse its array, a user's function may write to it."""
-    return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
-
-
-def same_observation(one: Any, other: Any) -> bool:
-    """Whether two observations, or batches of them, are equal."""
-    if isinstance(one, Mapping):
-        return all(np.array_equal(one[key], other[key]) for key in one)
-    return np.array_equal(one, other)
-
-
-def resolve(function: F | str, argument: str) -> F:
-    """Returns ``function``, importing it first when it is a dotted name such as ``"package.module.function"``.
-
-    :param argument: the name of the constructor argument, for the error message
-    """
-    if callable(function):
-        return function
-    parts = function.split(".") if isinstance(function, str) else []
-    if len(parts) < 2 or not all(map(str.isidentifier, parts)):
-        raise TypeError(
-            f"`{argument}` must be a function or its dotted name 'package.module.function', but is {function!r}."
-        )
-    try:
-        found = getattr(importlib.import_module(".".join(parts[:-1])), parts[-1])
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"`{argument}`: {function!r} cannot be imported ({error}): give 'package.module.function' "
-            "of a module that is on the Python path."
-        ) from error
-    if not callable(found):
-        raise TypeError(f"`{argument}`: {function!r} names a {type(found).__name__}, but must name a function.")
-    return found  # type: ignore[no-any-return]
-
-
-def ask(
+def query_labels(
     function: Callable[..., Any], argument: str, obs: Observations, actions: np.ndarray[Any, Any], *next_obs: Any
 ) -> BoolArray:
-    """Asks a user's function about a batch of actions and checks what comes back.
+    """Calls a user's function with a batch of actions and checks the labels that it returns.
 
     :param argument: the name of the constructor argument that holds the function, for the error messages
     :param next_obs: s', where the function takes it

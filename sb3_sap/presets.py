@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from sb3_sap.errors import is_number, nearest
+from sb3_sap.common.errors import is_number, nearest
 
 #: Keys of RL Zoo's format that tell its runner, not the algorithm's constructor, what to do.
 RUNNER_KEYS = frozenset(

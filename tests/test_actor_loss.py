@@ -9,8 +9,8 @@ from torch.nn import functional as F
 from toy import DISCRETE, GUIDED, Line, build
 
 from sb3_sap import DDPGAP, DQNAP, QRDQNAP, SACAP, TD3AP, CrossQAP
-from sb3_sap.actor_loss import permissible_actor_step, permissible_value_step
-from sb3_sap.candidates import action_values
+from sb3_sap.guidance.auxiliary_loss import permissible_actor_step, permissible_value_step
+from sb3_sap.guidance.values import action_values
 
 WIDE = {"predictor_kwargs": {"net_arch": [32]}, "dataset_size": 64, "policy_kwargs": {"net_arch": [32]}}
 
@@ -104,7 +104,9 @@ def test_a_schedule_that_is_none_is_told(value):
 
 def test_it_waits_until_e_is_good_enough(monkeypatch):
     calls = []
-    monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
+    monkeypatch.setattr(
+        "sb3_sap.guidance.auxiliary_update.permissible_actor_step", lambda *args: calls.append(args) or 0.0
+    )
     model = build(DDPGAP, actor_permissibility_coef=1.0)
     model.learn(60)
     calls.clear()
@@ -128,7 +130,9 @@ def test_it_waits_until_e_is_good_enough(monkeypatch):
 )
 def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, algorithm, growths, numbers):
     calls = []
-    monkeypatch.setattr("sb3_sap.exploration.permissible_actor_step", lambda *args: calls.append(args) or 0.0)
+    monkeypatch.setattr(
+        "sb3_sap.guidance.auxiliary_update.permissible_actor_step", lambda *args: calls.append(args) or 0.0
+    )
     model = build(algorithm, actor_permissibility_coef=1.0, **growths).learn(60)
     model.validation_accuracy, model._n_updates = 1.0, 2
     calls.clear()
@@ -142,10 +146,11 @@ def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, algor
 @pytest.mark.parametrize(("growth", "last"), [(None, 59), (0.0, 100)])
 def test_it_ends_with_guidance_unless_it_has_a_rhythm_of_its_own(monkeypatch, growth, last):
     steps = []
-    monkeypatch.setattr(DDPGAP, "predictor_suffices", True)
+    monkeypatch.setattr(DDPGAP, "predictor_accurate", True)
     model = build(DDPGAP, actor_permissibility_coef=1.0, guidance_end=60, teaching_growth=growth)
     monkeypatch.setattr(
-        "sb3_sap.exploration.permissible_actor_step", lambda *args: steps.append(model.num_timesteps) or 0.0
+        "sb3_sap.guidance.auxiliary_update.permissible_actor_step",
+        lambda *args: steps.append(model.num_timesteps) or 0.0,
     )
     model.learn(100)
     assert max(steps) == last

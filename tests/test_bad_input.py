@@ -18,8 +18,8 @@ from sb3_sap import (
     ActionPermissibilityMixin,
     ConstrainedExplorationMixin,
 )
-from sb3_sap.action_spaces import check_action_space
-from sb3_sap.settings import make_action_noise
+from sb3_sap.common.action_noise import make_action_noise
+from sb3_sap.common.spaces import check_action_space
 
 F32 = np.finfo(np.float32)
 
@@ -120,15 +120,15 @@ def test_a_wrapper_that_labels_with_numbers():
         ({"alpha": "much"}, "^`alpha` is a probability from 0 to 1, but is 'much'"),
         ({"t_k": -1}, "^`t_k` must be a whole number of at least 0, but is -1"),
         ({"t_k": "100"}, "^`t_k` must be a whole number of at least 0, but is '100'"),
-        ({"refit_growth": "0.1"}, "^`refit_growth` is a share from 0 to below 1, but is '0.1'"),
+        ({"refit_growth": "0.1"}, "^`refit_growth` is a fraction from 0 to below 1, but is '0.1'"),
         (
             {"knowledge_buffer_size": 1e4},
             "^`knowledge_buffer_size` must be a whole number of at least 4, but is 10000.0",
         ),
         ({"n_candidates": 0}, "^`n_candidates` must be a whole number of at least 1, but is 0"),
-        ({"refit_growth": 1.0}, "^`refit_growth` is a share from 0 to below 1, but is 1.0"),
-        ({"teaching_growth": 1}, "^`teaching_growth` is a share from 0 to below 1, but is 1"),
-        ({"refit_growth": -0.1}, "^`refit_growth` is a share from 0 to below 1, but is -0.1"),
+        ({"refit_growth": 1.0}, "^`refit_growth` is a fraction from 0 to below 1, but is 1.0"),
+        ({"teaching_growth": 1}, "^`teaching_growth` is a fraction from 0 to below 1, but is 1"),
+        ({"refit_growth": -0.1}, "^`refit_growth` is a fraction from 0 to below 1, but is -0.1"),
         ({"min_per_class": 0}, "^`min_per_class` must be a whole number of at least 1, but is 0"),
         ({"dataset_size": 1}, "^`dataset_size` must be a whole number of at least 2, but is 1"),
         ({"validation_size": 0}, "^`validation_size` must be a whole number of at least 2, but is 0"),

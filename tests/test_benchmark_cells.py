@@ -14,7 +14,7 @@ from sb3_sap.benchmark.columns import GROUPS, Column, parse_column, parse_column
 from sb3_sap.benchmark.learners import CLASSES, make_model, settings_of
 from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.training import Recorder, how_ended, run_cell
-from sb3_sap.envs.lane_keeping import STEERING_LOCK
+from sb3_sap.envs.car import STEERING_LOCK
 from sb3_sap.envs.torcs.installation import TorcsNotFoundError, find_installation
 
 
@@ -198,7 +198,7 @@ def test_evaluation_does_not_change_training(algo):
         return model
 
     def evaluate(policy):
-        from sb3_sap.evaluation import drive_lap
+        from sb3_sap.evaluation.laps import drive_lap
 
         evaluated.append(policy.num_timesteps)
         drive_lap(policy, "g-track-3")

@@ -18,8 +18,8 @@ from sb3_sap.benchmark.results import collect
 from sb3_sap.benchmark.summary import improvement
 from sb3_sap.benchmark.tables import curve_table
 from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, LAP_COLUMNS, TIME_COLUMNS
-from sb3_sap.cli import main
-from sb3_sap.statistics import probability_of_improvement
+from sb3_sap.cli.main import main
+from sb3_sap.evaluation.statistics import probability_of_improvement
 
 MADE = {"versions": {"python": "3.11"}, "machine": "a machine", "date": "2020-01-02", "revision": "abc"}
 #: S from 250 steps on, and from 500 on, by algorithm; what is below 0.5 is a lap that was not done.

@@ -13,7 +13,7 @@ from rich.console import Console
 from sb3_sap.benchmark import process, runner
 from sb3_sap.benchmark.cells import make_grid, read_result
 from sb3_sap.benchmark.columns import parse_columns
-from sb3_sap.cli import main
+from sb3_sap.cli.main import main
 
 
 def grid(*columns, seeds=2, steps=50):
@@ -132,7 +132,7 @@ def test_a_process_that_fails_or_dies_says_so():
 def command(out, *more):
     fixed = ["--simulator", "highway", "--columns", "ddpg", "ddpg_ap", "--steps", "40", "--seeds", "2"]
     fixed += ["--tracks", "g-track-3", "--out", str(out), *more]
-    return [sys.executable, "-m", "sb3_sap.cli", "benchmark", "run", *fixed]
+    return [sys.executable, "-m", "sb3_sap.cli.main", "benchmark", "run", *fixed]
 
 
 def wait_for(condition):

@@ -12,7 +12,7 @@ from sb3_sap.benchmark.results import collect
 from sb3_sap.benchmark.returns import mean_returns, steps_to_return
 from sb3_sap.benchmark.tasks import EPISODES, RETURN_COLUMNS, evaluation, evaluations, task_columns
 from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS, run_cell
-from sb3_sap.cli import main
+from sb3_sap.cli.main import main
 from sb3_sap.presets import load_config
 
 CAR = "MountainCarContinuous-v0"

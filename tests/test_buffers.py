@@ -21,7 +21,7 @@ from sb3_sap import (
     PermissibilityNStepReplayBuffer,
     PermissibilityReplayBuffer,
 )
-from sb3_sap.buffers import guided_buffer_class
+from sb3_sap.predictor.buffers import guided_buffer_class
 
 VARIANTS = [
     pytest.param("array", {}, PermissibilityReplayBuffer, id="array"),

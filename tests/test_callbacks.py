@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import GUIDED, Line, build
 
 from sb3_sap import DDPGAP, PermissibilityCallback
-from sb3_sap.knowledge import LabelledActions
+from sb3_sap.predictor.knowledge import LabelledActions
 
 
 class Recorder(PermissibilityCallback):
@@ -111,7 +111,7 @@ def test_after_guidance_every_fifth_fit_is_left_and_the_actor_does_not_notice(mo
     assert [step for step in callback.fits if step >= 30] == [30, 35, 40, 45, 50, 55, 60]
 
     rarely = build(DDPGAP, guidance_end=30, min_per_class=1).learn(60)
-    monkeypatch.setattr("sb3_sap.exploration.FITS_AFTER_GUIDANCE", 1)
+    monkeypatch.setattr("sb3_sap.guidance.auxiliary_update.FITS_AFTER_GUIDANCE", 1)
     often = build(DDPGAP, guidance_end=30, min_per_class=1).learn(60)
     assert rarely.predictor.n_updates < often.predictor.n_updates
     assert all(map(th.equal, rarely.actor.parameters(), often.actor.parameters()))

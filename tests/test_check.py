@@ -8,14 +8,15 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import Line, build, towards_centre
 
-from sb3_sap import DDPGAP, DQNAP, SACAP, ActionPermissibility, check_permissibility, quick_classifier
-from sb3_sap.trials import N_ACTIONS
+from sb3_sap import DDPGAP, DQNAP, SACAP, ActionPermissibility, check_permissibility
+from sb3_sap.check import classifier
+from sb3_sap.check.trials import N_ACTIONS
 
 
 @pytest.fixture(autouse=True)
 def fewer_fits(monkeypatch):
     """The classifiers of these problems need no more."""
-    monkeypatch.setattr(quick_classifier, "FITS", 40)
+    monkeypatch.setattr(classifier, "FITS", 40)
 
 
 class FixedLine(Line):
@@ -125,7 +126,7 @@ def test_a_classifier_that_does_not_see_the_action():
 
 
 def test_the_steps_that_come_back_to_states_are_as_many_as_told(monkeypatch):
-    monkeypatch.setattr(quick_classifier, "FITS", 1)
+    monkeypatch.setattr(classifier, "FITS", 1)
 
     def steps(kind, function, **kwargs):
         env = kind(**kwargs)
@@ -244,7 +245,7 @@ PICTURES = [spaces.Box(0, 255, shape, np.uint8) for shape in ((36, 36, 3), (3, 2
     ids=str,
 )
 def test_observations_that_sb3_takes(space, monkeypatch):
-    monkeypatch.setattr(quick_classifier, "FITS", 3)
+    monkeypatch.setattr(classifier, "FITS", 3)
     shapes = []
 
     def steps_left(obs, actions, next_obs):
@@ -324,7 +325,7 @@ def energy_did_not_fall(obs, actions, next_obs):
 
 
 def test_mountain_car(monkeypatch):
-    monkeypatch.setattr(quick_classifier, "FITS", 120)
+    monkeypatch.setattr(classifier, "FITS", 120)
     env = gym.make("MountainCarContinuous-v0")
     with_velocity, against = (
         check(env, energy_did_not_fall, policy=lambda obs, sign=sign: sign * np.sign(obs[1:])) for sign in (1, -1)

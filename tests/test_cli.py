@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from sb3_sap import DDPGAP
-from sb3_sap.cli import main
-from sb3_sap.hub import EXTRAS
+from sb3_sap.cli.hub import EXTRAS
+from sb3_sap.cli.main import main
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_help(command, capsys):
 
 
 def test_ctrl_c_leaves_a_loadable_model(tmp_path):
-    command = [sys.executable, "-m", "sb3_sap.cli", "demo", "--steps", "100000", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "sb3_sap.cli.main", "demo", "--steps", "100000", "--out", str(tmp_path)]
     for name in EXTRAS:  # of another model
         (tmp_path / name).write_text("old")
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)

@@ -93,7 +93,7 @@ def test_the_highest_q_wins(algorithm):
 def test_e_learns_and_guides_the_greedy_actions(algorithm):
     # 400 random steps; right of the centre only going left, or standing still, is permissible.
     model = build(algorithm, learning_starts=400, dataset_size=64, predictor_kwargs={"net_arch": [32]}).learn(400)
-    assert model.predictor_suffices
+    assert model.predictor_accurate
     rows = np.array([[-0.8, 0.5], [-0.4, 0.5], [0.4, 0.5], [0.8, 0.5]], dtype=np.float32)
     actions = model.predict(rows, deterministic=True, guided=True)[0]
     assert (actions[:2] >= 1).all()

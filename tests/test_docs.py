@@ -19,7 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 import sb3_sap
 from sb3_sap import DDPGAP, envs, plots, zoo
 from sb3_sap.algorithms import ALGORITHMS
-from sb3_sap.cli import main, parser
+from sb3_sap.cli.main import main, parser
 
 matplotlib.use("agg")
 

@@ -10,10 +10,11 @@ from rich.console import Console
 
 from sb3_sap import DDPGAP
 from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
-from sb3_sap.demo import TrainingLog, results_table
+from sb3_sap.cli.demo import TrainingLog, results_table
 from sb3_sap.envs import get_track
-from sb3_sap.envs.lane_keeping import STEERING_LOCK
-from sb3_sap.evaluation import LapResult, drive_lap, lap, lap_env, load_policy, write_results
+from sb3_sap.envs.car import STEERING_LOCK
+from sb3_sap.evaluation.laps import LapResult, drive_lap, lap, lap_env, write_results
+from sb3_sap.evaluation.policies import load_policy
 
 
 class Feedback:

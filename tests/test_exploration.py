@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from toy import GUIDED, Line, build, nearby
 
 from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, SACAP, TD3AP, TQCAP, CrossQAP
-from sb3_sap.candidates import stratified_candidates
+from sb3_sap.guidance.candidates import stratified_candidates
 
 
 class StubPredictor:

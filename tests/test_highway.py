@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 import sb3_sap  # noqa: F401  # registers the environment
 from sb3_sap.envs import CarState, get_track, highway, score
+from sb3_sap.envs.car import STEERING_LOCK
 from sb3_sap.envs.highway import HighwaySimulator, road_network
-from sb3_sap.envs.lane_keeping import STEERING_LOCK
 from sb3_sap.envs.tracks import Segment, Track
 
 STEP_LENGTH = 50 / 3.6 * 0.2

@@ -11,9 +11,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import Line, build
 
 from sb3_sap import DDPGAP
-from sb3_sap.cli import main
-from sb3_sap.evaluation import load_policy
-from sb3_sap.hub import find_trained, prepare
+from sb3_sap.cli.hub import find_trained, prepare
+from sb3_sap.cli.main import main
+from sb3_sap.evaluation.policies import load_policy
 
 LAPS = [
     {"track": "eroad", "lap_done": True, "covered": 1.0, "total_reward": 1.0, "score": 0.9, "steps": 1},

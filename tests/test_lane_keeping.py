@@ -216,7 +216,7 @@ def test_random_starts_follow_the_seed() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"track_po": 0}, "got 'track_po'; did you mean 'track_pos'"),
+        ({"track_po": 0}, "got 'track_po': did you mean 'track_pos'"),
         ({"distance": -1}, r"options\['distance'\] must lie in \[0, 100\] m, got -1"),
         ({"track_pos": 1.5}, r"options\['track_pos'\] must lie in \[-1, 1\], got 1.5"),
         ({"angle": math.nan}, r"options\['angle'\] must lie in \[-1.5708, 1.5708\] rad, got nan"),

@@ -1,8 +1,9 @@
-"""Doors open downward only."""
+"""Imports point downward only, module by module, and in no circle."""
 
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -10,40 +11,46 @@ import pytest
 import sb3_sap
 
 PACKAGE = Path(sb3_sap.__file__).parent
-# From the top. A room may use those below it and its neighbours on the same floor.
-FLOORS = (
+# From the top. A package or module may import its own modules, its own layer's where they form no circle, and those
+# below; the environments and their tasks are a tower of their own, which only the upper layers know.
+LAYERS = (
     {"cli"},
-    {"demo", "hub", "card"},
-    {"zoo", "benchmark", "evaluation", "normalisation", "plots", "beliefs", "presets", "statistics"},
+    {"zoo", "benchmark"},
+    {"plots", "evaluation"},
+    {"presets"},
     {"algorithms"},
-    {"exploration", "check", "trials", "quick_classifier"},
-    {"learning"},
-    {
-        "constraints",
-        "callbacks",
-        "buffers",
-        "knowledge",
-        "predictor",
-        "settings",
-        "actor_loss",
-        "candidates",
-        "prediction",
-        "watching",
-    },
-    {"action_spaces", "vec_envs"},
-    {"permissibility", "generators", "files", "errors", "advice", "tensorboard"},
+    {"guidance", "check"},
+    {"predictor"},
+    {"permissibility"},
+    {"common"},
 )
-ENVS_MAY_USE = {"envs", "permissibility", "generators", "files"}
+TOWER = ({"tasks"}, {"envs"})
+MAY_KNOW_ENVIRONMENTS = {"cli", "zoo", "benchmark", "evaluation", "plots"}
+# What of the lower layers environments and tasks may use: what knows NumPy and the standard library alone.
+ENVIRONMENTS_MAY_IMPORT = {
+    "sb3_sap.common.arrays",
+    "sb3_sap.common.errors",
+    "sb3_sap.common.files",
+    "sb3_sap.common.random",
+}
 
 
-def rooms():
-    """The modules and packages of the house, with their files."""
-    found = {path.stem: [path] for path in PACKAGE.glob("*.py") if path.stem != "__init__"}
-    return found | {path.parent.name: sorted(path.parent.rglob("*.py")) for path in PACKAGE.glob("*/__init__.py")}
+def modules():
+    """Every module of the package but its own ``__init__``, by dotted name."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        parts = ("sb3_sap", *path.relative_to(PACKAGE).with_suffix("").parts)
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        if name != "sb3_sap":
+            found[name] = path
+    return found
+
+
+MODULES = modules()
 
 
 def imports(path):
-    """The dotted names that a file imports when it runs, those for type checkers left out."""
+    """The dotted names that a file imports, lazily too, those for type checkers left out."""
     found = []
 
     def visit(node):
@@ -52,9 +59,8 @@ def imports(path):
         if isinstance(node, ast.Import):
             found.extend(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            start = path.relative_to(PACKAGE.parent).with_suffix("").parts[: -node.level] if node.level else ()
-            base = ".".join([*start, *(node.module.split(".") if node.module else [])])
-            found.extend([base, *(f"{base}.{alias.name}" for alias in node.names)])
+            assert node.level == 0, f"{path} imports relatively"
+            found.extend([node.module, *(f"{node.module}.{alias.name}" for alias in node.names)])
         for child in ast.iter_child_nodes(node):
             visit(child)
 
@@ -62,52 +68,68 @@ def imports(path):
     return found
 
 
-def rooms_used(paths):
-    used = {name.split(".")[1] for path in paths for name in imports(path) if name.startswith("sb3_sap.")}
-    return used & rooms().keys()
+def used(name):
+    """The modules of the package that a module imports: of ``from a.b import c`` a.b.c if it is a module, else a.b."""
+    found = {other for other in imports(MODULES[name]) if other in MODULES} - {name}
+    return {other for other in found if not any(longer.startswith(f"{other}.") for longer in found)}
 
 
-def floor(room):
-    return next((number for number, names in enumerate(FLOORS) if room in names), None)
+def top(name):
+    return name.split(".")[1]
 
 
-@pytest.mark.parametrize("room", sorted(rooms()))
-def test_doors_open_downward_only(room):
-    used = rooms_used(rooms()[room]) - {room}
-    upward = {other for other in used if None not in (floor(room), floor(other)) and floor(other) < floor(room)}
-    assert not upward
-    if room != "__main__":
-        assert "cli" not in used
-    # Below the algorithms nothing knows an environment.
-    if floor(room) is not None and floor(room) >= floor("algorithms"):
-        assert "envs" not in used
+def layer(name):
+    return next((number for number, names in enumerate(LAYERS) if top(name) in names), None)
 
 
-def test_every_room_of_the_method_has_a_floor():
-    assert {room for names in FLOORS[3:] for room in names} <= rooms().keys()
+def test_every_module_is_in_exactly_one_layer():
+    everything = [name for names in (*LAYERS, *TOWER) for name in names]
+    assert len(everything) == len(set(everything))
+    assert {top(name) for name in MODULES} == set(everything)
 
 
-def test_environments_know_no_algorithm():
-    paths = rooms().get("envs", [])
-    assert rooms_used(paths) <= ENVS_MAY_USE
-    assert not [name for path in paths for name in imports(path) if name.startswith(("stable_baselines3", "torch"))]
+@pytest.mark.parametrize("name", sorted(name for name in MODULES if layer(name) is not None))
+def test_imports_point_downward_only(name):
+    others = {other for other in used(name) if top(other) != top(name)}
+    assert {other for other in others if layer(other) is not None and layer(other) < layer(name)} == set()
+    assert "cli" not in {top(other) for other in others}
+    if top(name) not in MAY_KNOW_ENVIRONMENTS:
+        assert {other for other in others if layer(other) is None} == set()
 
 
-def test_ap_functions_of_tasks_know_what_an_environment_may():
-    assert rooms_used(rooms()["tasks"]) - {"tasks"} == {"permissibility"}
-    foreign = {name.split(".")[0] for path in rooms()["tasks"] for name in imports(path)} - sys.stdlib_module_names
-    assert foreign == {"numpy", "sb3_sap"}
+@pytest.mark.parametrize("name", sorted(name for name in MODULES if layer(name) is None))
+def test_environments_and_tasks_know_no_algorithm(name):
+    others = {other for other in used(name) if top(other) != top(name)}
+    assert others <= ENVIRONMENTS_MAY_IMPORT
+    foreign = {other.split(".")[0] for other in imports(MODULES[name])}
+    assert not foreign & {"stable_baselines3", "sb3_contrib", "torch"}
 
 
-def test_the_ap_function_knows_numpy_and_gymnasium_alone():
-    foreign = {name.split(".")[0] for name in imports(PACKAGE / "permissibility.py")} - sys.stdlib_module_names
-    assert foreign == {"gymnasium", "numpy"}
+def test_no_module_imports_itself_through_others():
+    try:
+        list(TopologicalSorter({name: used(name) for name in MODULES}).static_order())
+    except CycleError as error:
+        pytest.fail(f"a circle: {' -> '.join(error.args[1])}")
 
 
-def test_the_reader_of_imports_sees_them():
-    assert "sb3_sap.exploration.ActionPermissibilityMixin" in imports(PACKAGE / "algorithms.py")
-    assert rooms_used([PACKAGE / "algorithms.py"]) == {"constraints", "exploration"}
-    assert "exploration" not in rooms_used([PACKAGE / "callbacks.py"])  # for type checkers alone
+def test_tasks_need_numpy_alone():
+    foreign = {other.split(".")[0] for name in MODULES if top(name) == "tasks" for other in imports(MODULES[name])}
+    assert foreign - sys.stdlib_module_names == {"numpy", "sb3_sap"}
+
+
+def test_the_ap_function_needs_numpy_and_gymnasium_alone():
+    assert used("sb3_sap.permissibility") == {"sb3_sap.common.arrays"}
+    for name in ("sb3_sap.permissibility", "sb3_sap.common.arrays"):
+        foreign = {other.split(".")[0] for other in imports(MODULES[name])} - sys.stdlib_module_names
+        assert foreign <= {"gymnasium", "numpy", "sb3_sap"}
+
+
+def test_imports_are_read_as_they_are_written():
+    assert "sb3_sap.guidance.mixin.ActionPermissibilityMixin" in imports(MODULES["sb3_sap.algorithms"])
+    assert used("sb3_sap.algorithms") == {"sb3_sap.guidance.constrained", "sb3_sap.guidance.constraints"} | {
+        "sb3_sap.guidance.mixin"
+    }
+    assert "sb3_sap.envs.viewer" in used("sb3_sap.envs.lane_keeping")  # though only when something is drawn
 
 
 def test_importing_the_package_brings_no_simulator_and_no_plotting():
@@ -123,3 +145,7 @@ def test_importing_the_package_brings_no_simulator_and_no_plotting():
     heavy = ("pygame", "highway_env", "matplotlib", "pandas", "scipy", "PIL", "rl_zoo3", "optuna", "rich", "moviepy")
     assert "sb3_sap.algorithms" in new
     assert [name for name in new if name.split(".")[0] in heavy] == []
+    # Of the package itself, what trains comes along, and neither commands nor the benchmark.
+    assert {"cli", "zoo", "benchmark", "evaluation", "plots"} & {
+        top(n) for n in new if n.startswith("sb3_sap.")
+    } == set()

@@ -14,8 +14,8 @@ from gymnasium import spaces
 from toy import build
 
 from sb3_sap import DDPGAP, KnowledgeBuffer, PermissibilityPredictor
-from sb3_sap.candidates import stratified_candidates
-from sb3_sap.knowledge import LabelledActions
+from sb3_sap.guidance.candidates import stratified_candidates
+from sb3_sap.predictor.knowledge import LabelledActions
 
 FILE = Path(__file__).resolve().parents[1] / "examples" / "ddpg_ap_minimal.py"
 OBS, ACTIONS = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
@@ -117,9 +117,9 @@ def test_algorithm_1_decides_alike():
     for seed in range(300):
         obs, action = np.float32(rng.uniform(-3, 3, (1, 2))), np.float32(rng.uniform(-1, 1, (1, 1)))
         candidates = np.float32(rng.uniform(-1, 1, (16, 1)))
-        model._candidates = lambda rows, n_envs, given=candidates: (given[None], np.ones((1, 16), bool))
-        model._last_obs, model._rng = obs, np.random.default_rng(seed)
-        guided = model._guide(action)
+        model.sample_candidates = lambda rows, n_envs, given=candidates: (given[None], np.ones((1, 16), bool))
+        model._last_obs, model.exploration_rng = obs, np.random.default_rng(seed)
+        guided = model.guide(action)
         theirs = action[0] if guided is None else guided[0]
         mine = minimal.select_action(
             np.random.default_rng(seed), own, obs[0], action[0], 0.7, lambda given=candidates: given

@@ -33,9 +33,9 @@ from sb3_sap import (
     plots,
     preset,
 )
-from sb3_sap.cli import main
+from sb3_sap.cli.main import main
 from sb3_sap.envs.tracks import get_track
-from sb3_sap.evaluation import load_policy
+from sb3_sap.evaluation.policies import load_policy
 
 LANE, TORCS = "sap/LaneKeeping-v0", "sap/TorcsLaneKeeping-v0"
 #: Characters that a sentence may have, and words that tell what to do or what was expected.
@@ -194,8 +194,10 @@ CONSTRUCTORS = [
     Row("actor_learning_rate", having(actor_learning_rate="fast"), ValueError, "^`actor_learning_rate` must be a num"),
     Row("actor_learning_rate", having(DQNAP, actor_learning_rate=1e-3), ValueError, "DQNAP has no actor: set `learn"),
     Row("learning_rate", having(learning_rate="lin_x"), ValueError, "^`learning_rate` must be a number, a schedule"),
-    Row("refit_growth", having(refit_growth=5), ValueError, "^`refit_growth` is a share from 0 to below 1, but is 5"),
-    Row("teaching_growth", having(teaching_growth="a"), ValueError, "^`teaching_growth` is a share .* but is 'a'"),
+    Row(
+        "refit_growth", having(refit_growth=5), ValueError, "^`refit_growth` is a fraction from 0 to below 1, but is 5"
+    ),
+    Row("teaching_growth", having(teaching_growth="a"), ValueError, "^`teaching_growth` is a fraction .* but is 'a'"),
     Row("dataset_size", having(dataset_size=None), ValueError, "^`dataset_size` must be a whole number of at least 2"),
     Row("validation_size", having(validation_size=0.5), ValueError, "^`validation_size` must be a whole number"),
     Row("validation_fraction", having(validation_fraction="0.1"), ValueError, "must lie between 0 and 1, but is '0.1'"),
@@ -438,7 +440,7 @@ FILES = [
 ]
 
 ENVIRONMENTS = [
-    Row("track", given(gym.make, LANE, track="wheel2"), ValueError, "got 'wheel2'; did you mean 'wheel-2'"),
+    Row("track", given(gym.make, LANE, track="wheel2"), ValueError, "got 'wheel2': did you mean 'wheel-2'"),
     Row("track", given(gym.make, LANE, track="random:x"), ValueError, "did you mean 'random' or 'random:SEED'"),
     Row("broken.xml", given(get_track, "broken.xml"), ValueError, "is not a readable TORCS track file"),
     Row("Main Track", given(get_track, "other.xml"), ValueError, "has no section 'Main Track'.*not a TORCS track"),
@@ -461,7 +463,7 @@ ENVIRONMENTS = [
     ),
     Row("control_step", given(gym.make, TORCS, control_step="a"), ValueError, "must be a positive multiple of 0.002 s"),
     Row("off_track_reward", given(gym.make, LANE, off_track_reward="a"), ValueError, "must be a number, got 'a'"),
-    Row("options", reset(dist=3), ValueError, "may hold distance, track_pos and angle, got 'dist'; did you mean 'dist"),
+    Row("options", reset(dist=3), ValueError, "may hold distance, track_pos and angle, got 'dist': did you mean 'dist"),
     Row("track_pos", reset(track_pos=30), ValueError, r"must lie in \[-1, 1\], got 30"),
     Row("action", given(drive, np.array([np.nan])), ValueError, r"^action must be numbers in \[-1, 1\], got \[nan\]"),
     Row(
@@ -477,7 +479,7 @@ COMMANDS = [
     Row("--seed", command("demo --seed -1"), 2, "argument --seed: must be 0 or more, but is -1"),
     Row("--setps", command("demo --setps 3"), 2, "unrecognized arguments: --setps 3"),
     Row("papper", command("demo --preset papper"), 1, "'papper' is unknown: did you mean 'paper'"),
-    Row("track", command("demo --track wheel2"), 1, "got 'wheel2'; did you mean 'wheel-2'"),
+    Row("track", command("demo --track wheel2"), 1, "got 'wheel2': did you mean 'wheel-2'"),
     Row("broken.xml", command("demo --track broken.xml"), 1, "is not a readable TORCS track file"),
     Row("COMMAND", command("nothing"), 2, "invalid choice: 'nothing' .choose from 'demo', 'evaluate'"),
     Row("nothing.zip", command("evaluate nothing.zip"), 1, "There is no model file nothing.zip: give the .zip"),

@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from toy import Line, build
 
 from sb3_sap import DDPGAP
-from sb3_sap.cli import main
-from sb3_sap.evaluation import load_policy
-from sb3_sap.normalisation import NormalisedPolicy, find_statistics
+from sb3_sap.cli.main import main
+from sb3_sap.evaluation.normalisation import NormalisedPolicy, find_statistics
+from sb3_sap.evaluation.policies import load_policy
 
 OBS = np.array([[0.3, 0.9], [-0.5, 0.1]], dtype=np.float32)
 

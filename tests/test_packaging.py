@@ -36,7 +36,7 @@ PROGRAMS = {
     """,
     "dask": "import distributed, sb3_sap.benchmark.runner",
     "docs": "import furo, myst_parser, sphinx.application",
-    "hub": "import huggingface_sb3, sb3_sap.hub",
+    "hub": "import huggingface_sb3, sb3_sap.cli.hub",
     "tensorboard": """
         sb3_sap.DDPG("MlpPolicy", "Pendulum-v1", tensorboard_log="boards").learn(10)
         import tensorboard.program
@@ -60,7 +60,7 @@ ALONE = """
 
     sys.meta_path[:] = map(Without, sys.meta_path)
     import sb3_sap
-    from sb3_sap.cli import main
+    from sb3_sap.cli.main import main
     assert sb3_sap.__file__.startswith({site!r}), sb3_sap.__file__
 """
 

@@ -5,7 +5,8 @@ import pytest
 import toy
 
 from sb3_sap import ActionPermissibility
-from sb3_sap.permissibility import ask, labels_from_infos, resolve
+from sb3_sap.common.functions import resolve
+from sb3_sap.permissibility import labels_from_infos, query_labels
 
 
 def closer(obs, action, next_obs):
@@ -76,7 +77,7 @@ ACTIONS = np.array([[-1.0], [1.0]])
 
 
 def test_function_labels_are_returned_row_by_row():
-    np.testing.assert_array_equal(ask(toy.towards_centre, "ap_function", OBS, ACTIONS, NEXT), [True, False])
+    np.testing.assert_array_equal(query_labels(toy.towards_centre, "ap_function", OBS, ACTIONS, NEXT), [True, False])
 
 
 def raises(obs, actions, next_obs):
@@ -106,7 +107,7 @@ def raises(obs, actions, next_obs):
 )
 def test_function_that_returns_no_labels_is_named(function, error, message):
     with pytest.raises(error, match=re.escape(message)):
-        ask(function, "ap_function", OBS, ACTIONS, NEXT)
+        query_labels(function, "ap_function", OBS, ACTIONS, NEXT)
 
 
 def test_info_labels_are_collected_in_the_order_of_the_environments():

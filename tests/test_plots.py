@@ -9,10 +9,10 @@ from test_viewer import eastward
 from toy import Line, build
 
 from sb3_sap import DDPGAP, DQNAP
-from sb3_sap.beliefs import permissible_probability
 from sb3_sap.envs.viewer import LINE
+from sb3_sap.evaluation.predictor_plots import permissible_probability
 from sb3_sap.plots import plot_permissibility, return_curves, save
-from sb3_sap.tensorboard import LAYOUT
+from sb3_sap.predictor.tensorboard import LAYOUT
 
 LINEAR = {"net_arch": []}  # E is one linear layer
 

@@ -9,7 +9,8 @@ from test_exploration import StubPredictor, above, deny, guided, never, sample
 from toy import GUIDED, Line, build
 
 from sb3_sap import DDPGAP, SACAP, GuidedPolicy
-from sb3_sap.candidates import SELECTIONS, choose, q_values
+from sb3_sap.guidance.candidates import SELECTIONS, choose
+from sb3_sap.guidance.values import q_values
 
 
 def predicting(rule, actor=0.0, env=None, **settings):

@@ -6,7 +6,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from torch import nn
 
 from sb3_sap import PermissibilityPredictor
-from sb3_sap.knowledge import LabelledActions
+from sb3_sap.predictor.knowledge import LabelledActions
 
 OBS, ACTIONS = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
 

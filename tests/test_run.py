@@ -18,7 +18,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import ALGORITHMS, GUIDED, Line, build
 
 from sb3_sap import DDPGAP, CrossQAP, PermissibilityCallback
-from sb3_sap.settings import PAPER_STEPS
+from sb3_sap.common.settings import PAPER_STEPS
 
 # CrossQ has no policy but MlpPolicy.
 every_algorithm_but_crossq = pytest.mark.parametrize("algorithm", [cls for cls in ALGORITHMS if cls is not CrossQAP])

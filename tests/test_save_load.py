@@ -40,7 +40,7 @@ def state(model):
     names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pos", "full")
     found["R"] = [getattr(model.replay_buffer, name) for name in names]
     if hasattr(model, "_rng"):
-        found["rng"] = model._rng.bit_generator.state
+        found["rng"] = model.exploration_rng.bit_generator.state
     if type(model) in GUIDED + DISCRETE:
         found |= {"K": knowledge_state(model), "accuracy": model.validation_accuracy, "alpha": model.current_alpha}
         found |= {"fitted": model.predictor.fitted, "earlier": model._steps_of_earlier_learns}
@@ -306,7 +306,7 @@ def test_load_heeds_a_new_seed(tmp_path):
 
     def draws(**settings):
         model = DDPGAP.load(tmp_path / "model", **settings)
-        return model._rng.random(), model.replay_buffer.knowledge.rng.random()
+        return model.exploration_rng.random(), model.replay_buffer.knowledge.rng.random()
 
     assert draws(seed=5) == draws(seed=5) != draws(seed=6)
     assert draws()[0] == draws()[0]  # goes on where the saved one was

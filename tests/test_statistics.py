@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_sap.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
+from sb3_sap.evaluation.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
 
 
 def test_interquartile_mean_drops_a_quarter_at_each_end():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_sap import check_permissibility, tasks
-from sb3_sap.permissibility import resolve
+from sb3_sap.common.functions import resolve
 from sb3_sap.presets import algorithms, load_config
 from sb3_sap.tasks.driving import SCALES, approach_speed, passing_distance
 from sb3_sap.tasks.energy import acrobot_energy, flag_within_reach

@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 from stable_baselines3.common.env_checker import check_env as check_sb3
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_sap.cli import main
+from sb3_sap.cli.main import main
 from sb3_sap.envs import TRACKS, get_track
-from sb3_sap.envs.lane_keeping import STEERING_LOCK
+from sb3_sap.envs.car import STEERING_LOCK
 from sb3_sap.envs.torcs import installation
 from sb3_sap.envs.torcs.installation import DATA, MODULES, Installation, TorcsNotFoundError, find_installation
+from sb3_sap.envs.torcs.physics import Physics
 from sb3_sap.envs.torcs.probe import survives
 from sb3_sap.envs.torcs.replay import replay
-from sb3_sap.envs.torcs.simulation import Simulation
 from sb3_sap.envs.torcs.simulator import TorcsSimulator, race_grid
 from sb3_sap.envs.torcs.track_files import flatten
 
@@ -122,7 +122,7 @@ def test_start_of_the_race_engine(torcs):
         grid = race_grid(torcs.track(name), conditions["track_length_m"])
         assert grid["distance"] == pytest.approx(conditions["grid"]["start_pos_m"])
         assert grid["track_pos"] == pytest.approx(conditions["grid"]["trackPos"])
-        simulation = Simulation(name)
+        simulation = Physics(name)
         simulation.place(**grid)
         settled = conditions["settled"]
         assert simulation.pose == pytest.approx((settled["x_m"], settled["y_m"], settled["yaw_rad"]), abs=1e-4)
@@ -131,7 +131,7 @@ def test_start_of_the_race_engine(torcs):
 
 @pytest.mark.parametrize("name", list(TRACKS))
 def test_shipped_plans_are_those_of_torcs(torcs, name):
-    simulation = Simulation(name)
+    simulation = Physics(name)
     assert simulation.length == pytest.approx(get_track(name).length, abs=0.06)
     assert simulation.road.segments[0].width == get_track(name).width
     simulation.close()
@@ -305,7 +305,7 @@ def test_libraries_are_used_again(torcs):
 def test_closing_gives_everything_back(torcs):
     def resident_after(times):
         for _ in range(times):
-            simulation = Simulation("g-track-3")
+            simulation = Physics("g-track-3")
             simulation.place(0.0)
             simulation.close()
         gc.collect()
@@ -357,7 +357,7 @@ def test_actions_that_are_no_numbers(torcs, name):
 
 
 def test_simulation_checks_what_it_is_given(torcs):
-    simulation = Simulation("g-track-3")
+    simulation = Physics("g-track-3")
     with pytest.raises(RuntimeError, match="place"):
         simulation.advance(1)
     with pytest.raises(RuntimeError, match="place"):
@@ -369,13 +369,13 @@ def test_simulation_checks_what_it_is_given(torcs):
         with pytest.raises(ValueError, match="Controls must lie"):
             simulation.control(*controls)
     with pytest.raises(ValueError, match="skill_level"):
-        Simulation("g-track-3", skill_level=7)
+        Physics("g-track-3", skill_level=7)
 
 
 @pytest.mark.parametrize("reading", ["angle", "heading", "track_pos", "distance"])
 def test_no_reading_without_a_road(torcs, reading):
     """TORCS itself would read from address 0, or from a track that was given back."""
-    simulation = Simulation("g-track-3")
+    simulation = Physics("g-track-3")
     with pytest.raises(RuntimeError, match="place"):
         getattr(simulation, reading)
     simulation.place(0.0)
@@ -386,13 +386,13 @@ def test_no_reading_without_a_road(torcs, reading):
 
 
 def test_places_off_the_road_and_factors_out_of_range(torcs):
-    simulation = Simulation("g-track-3")
+    simulation = Physics("g-track-3")
     for place in ((0.0, 1.5), (0.0, -1e9), (0.0, 0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1e30)):
         with pytest.raises(ValueError, match="placed on the road"):
             simulation.place(*place)
     for factors in ({"fuel_factor": math.nan}, {"damage_factor": -1.0}, {"damage_factor": 1e30}):
         with pytest.raises(ValueError, match="_factor must lie in"):
-            Simulation("g-track-3", **factors)
+            Physics("g-track-3", **factors)
 
 
 @pytest.mark.skipif(shutil.which("localedef") is None, reason="localedef is not there to make a locale")
@@ -405,8 +405,8 @@ def test_a_locale_with_a_decimal_comma(torcs, tmp_path):
         pytest.skip(f"localedef makes no de_DE here: {made.stderr.decode().strip()[:100]}")
     code = (
         "import locale; locale.setlocale(locale.LC_ALL, 'de_DE.UTF-8')\n"
-        "from sb3_sap.envs.torcs.simulation import Simulation\n"
-        "print(Simulation('wheel-2').length, locale.localeconv()['decimal_point'])"
+        "from sb3_sap.envs.torcs.physics import Physics\n"
+        "print(Physics('wheel-2').length, locale.localeconv()['decimal_point'])"
     )
     environment = {**os.environ, "LOCPATH": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
@@ -415,7 +415,7 @@ def test_a_locale_with_a_decimal_comma(torcs, tmp_path):
 
 def test_every_car_shifts(torcs):
     """The engines' red lines lie between 576 and 1,958 rad/s: gears go by the car's own."""
-    simulation = Simulation("g-track-3", "car1-ow1")
+    simulation = Physics("g-track-3", "car1-ow1")
     simulation.place(0.0)
     assert simulation.top_gear == 7
     simulation.control(0.0, 1.0, gear=7)
@@ -463,23 +463,23 @@ def test_damaged_car(copy_of_torcs):
     whole = car.read_text()
     car.write_text(whole[:5000])
     with pytest.raises(ValueError, match=r"not a readable TORCS car file"):
-        Simulation("g-track-3", installation=copy_of_torcs)
+        Physics("g-track-3", installation=copy_of_torcs)
     car.write_text(whole.replace('name="category"', 'name="kategorie"'))
     with pytest.raises(ValueError, match="names no category"):
-        Simulation("g-track-3", installation=copy_of_torcs)
+        Physics("g-track-3", installation=copy_of_torcs)
 
 
 def test_damaged_surfaces(copy_of_torcs):
     copy_of_torcs.surfaces().write_text("")
     with pytest.raises(ValueError, match=r"surfaces.xml, the road surfaces, is not the one"):
-        Simulation("g-track-3", installation=copy_of_torcs)
+        Physics("g-track-3", installation=copy_of_torcs)
 
 
 def test_a_simulation_that_outlives_its_module_ends_in_silence(torcs):
     code = (
         "import os\n"
-        "from sb3_sap.envs.torcs.simulation import Simulation\n"
-        "os.kept = Simulation('wheel-2')\n"  # JAX keeps environments alive like this
+        "from sb3_sap.envs.torcs.physics import Physics\n"
+        "os.kept = Physics('wheel-2')\n"  # JAX keeps environments alive like this
         "os.kept.place(0.0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -491,10 +491,10 @@ def test_a_track_without_a_road_leaves_no_trace(torcs, tmp_path):
     path = tmp_path / "empty.xml"
     path.write_bytes(flatten(torcs.track("eroad")).replace(b'name="Header"', b'name="a/b"'))
     code = (
-        "from sb3_sap.envs.torcs.simulation import Simulation\n"
-        f"try: Simulation({str(path)!r})\n"
+        "from sb3_sap.envs.torcs.physics import Physics\n"
+        f"try: Physics({str(path)!r})\n"
         "except ValueError as error: print(error)\n"
-        "Simulation('eroad').place(0.0)"
+        "Physics('eroad').place(0.0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -546,12 +546,12 @@ def test_no_track_file_kills_the_process(torcs, tmp_path_factory, data):
 
     def build_and_drive():
         with contextlib.suppress(ValueError):
-            simulation = Simulation(path)
+            simulation = Physics(path)
             simulation.drive_everywhere()
             simulation.close()
-        Simulation("g-track-3").drive_everywhere()
+        Physics("g-track-3").drive_everywhere()
 
-    # Longer than the trial that Simulation itself makes.
+    # Longer than the trial that Physics itself makes.
     assert survives(build_and_drive, limit=60) is None
 
 

@@ -10,7 +10,7 @@ import sb3_sap  # noqa: F401  # registers the environment
 from sb3_sap.envs import CarState, get_track
 from sb3_sap.envs.tracks import Segment, Track
 from sb3_sap.envs.viewer import ACCENT, ASPHALT, CAR, GRASS, SCALING, SIZE, Viewer
-from sb3_sap.evaluation import make_env
+from sb3_sap.evaluation.environments import make_env
 
 MIDDLE = (SIZE[1] // 2, SIZE[0] // 2)
 """Row and column."""

@@ -24,16 +24,17 @@ from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
 
 from sb3_sap import DDPGAP  # noqa: E402
 from sb3_sap.algorithms import ALGORITHMS  # noqa: E402
-from sb3_sap.cli import main  # noqa: E402
-from sb3_sap.evaluation import ENVIRONMENTS, drive_lap, load_policy  # noqa: E402
-from sb3_sap.exploration import ActionPermissibilityMixin  # noqa: E402
+from sb3_sap.cli.main import main  # noqa: E402
+from sb3_sap.evaluation.laps import ENVIRONMENTS, drive_lap  # noqa: E402
+from sb3_sap.evaluation.policies import load_policy  # noqa: E402
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin  # noqa: E402
 from sb3_sap.presets import load_config  # noqa: E402
 from sb3_sap.zoo.configs import check_hyperparameters  # noqa: E402
-from sb3_sap.zoo.figures import contour  # noqa: E402
 from sb3_sap.zoo.registration import register, small_buffers  # noqa: E402
 from sb3_sap.zoo.retest import summary  # noqa: E402
 from sb3_sap.zoo.spaces import t_k_range  # noqa: E402
 from sb3_sap.zoo.storages import SeededByTrial, is_surplus, open_storage, without_password  # noqa: E402
+from sb3_sap.zoo.study_plots import contour  # noqa: E402
 from sb3_sap.zoo.workers import count_workers, run_workers  # noqa: E402
 
 ENV = "sap/LaneKeeping-v0"

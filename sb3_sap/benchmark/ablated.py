@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.algorithms import DDPGAP
-from sb3_sap.callbacks import PermissibilityCallback
+from sb3_sap.predictor.callbacks import PermissibilityCallback
 
 
 class OtherUnits(FlattenExtractor):
@@ -74,9 +74,9 @@ class DDPGAPProposed(DDPGAP):
         self._proposed = scaled if self._proposed is None else self._proposed
         return action, scaled
 
-    def _guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
+    def guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
         self._proposed = actions.copy()
-        return super()._guide(actions)
+        return super().guide(actions)
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
         super()._store_transition(replay_buffer, *args, **kwargs)

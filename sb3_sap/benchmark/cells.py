@@ -13,8 +13,8 @@ from sb3_sap.benchmark.columns import Column
 from sb3_sap.benchmark.learners import defaults_of, environment_of, settings_of
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.benchmark.tasks import entry, evaluations
-from sb3_sap.evaluation import ENVIRONMENTS
-from sb3_sap.files import atomic_path
+from sb3_sap.common.files import atomic_path
+from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 #: Training steps after which the actor drives a lap of each test track; and at the end of the training.
 CHECKPOINTS = (100, 150, 200, 250, 350, 500, 750, 1000, 1500, 2000, 3000, 5000, 7500, 10000, 12500, 15000)

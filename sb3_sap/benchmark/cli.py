@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from sb3_sap.benchmark.paper import TEST_TRACKS
-from sb3_sap.errors import positive
-from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.common.command_line import positive
+from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 if TYPE_CHECKING:
     from sb3_sap.benchmark.cells import Cell

@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator, StrMethodFormatter
 from scipy import stats
 
 from sb3_sap.benchmark.columns import Column
-from sb3_sap.statistics import bootstrap_interval
+from sb3_sap.evaluation.statistics import bootstrap_interval
 
 WIDTH = 9
 #: Letters that fit side by side below a figure.

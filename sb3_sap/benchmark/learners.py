@@ -15,11 +15,13 @@ from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.columns import CONTROLLERS, Column, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
 from sb3_sap.benchmark.tasks import entry, task_settings
-from sb3_sap.evaluation import ENVIRONMENTS
-from sb3_sap.features import with_extractor
-from sb3_sap.permissibility import resolve
+from sb3_sap.common.action_noise import make_action_noise
+from sb3_sap.common.extractors import with_extractor
+from sb3_sap.common.functions import resolve
+from sb3_sap.common.schedules import as_schedule
+from sb3_sap.common.settings import SettingsMixin
+from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.presets import preset
-from sb3_sap.settings import SettingsMixin, as_schedule, make_action_noise
 
 #: The class of each algorithm, imported only when it is needed.
 CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {

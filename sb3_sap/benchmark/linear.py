@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sap.envs.lane_keeping import STEERING_LOCK
+from sb3_sap.envs.car import STEERING_LOCK
 
 #: steering = angle · angle/lock + track_pos · trackPos + speed_y · speedY/50, for each simulator. Those of
 #: highway are what `benchmarks/linear_gains.py` finds. On TORCS that search finds (2.2, -4.8, 0.8), a little better on

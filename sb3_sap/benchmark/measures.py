@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from sb3_sap.benchmark.results import Results
-from sb3_sap.permissibility import FloatArray
-from sb3_sap.statistics import bootstrap_interval, interquartile_mean
+from sb3_sap.common.arrays import FloatArray
+from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 #: S on every unseen track at which a policy is called competent.
 THRESHOLDS = (0.9, 0.95)

@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from sb3_sap.benchmark.results import Results
-from sb3_sap.files import atomic_path
+from sb3_sap.common.files import atomic_path
 
 DPI = 120
 

@@ -14,9 +14,9 @@ from sb3_sap.benchmark.drawing import line_figure
 from sb3_sap.benchmark.measures import median_reached, ms_per_step
 from sb3_sap.benchmark.pages import markdown, write_csv, write_figure, write_page
 from sb3_sap.benchmark.results import Results
-from sb3_sap.evaluation import find_environment
-from sb3_sap.permissibility import FloatArray
-from sb3_sap.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+from sb3_sap.common.arrays import FloatArray
+from sb3_sap.evaluation.environments import find_environment
+from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
 
 NOTE = (
     "A run's return is the mean over its evaluation episodes, whose seeds are the same for every run, of the actor "

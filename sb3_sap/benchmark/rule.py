@@ -15,8 +15,9 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_sap.benchmark.tasks import Episode
-from sb3_sap.evaluation import make_env
-from sb3_sap.permissibility import APFunction, ask, resolve
+from sb3_sap.common.functions import resolve
+from sb3_sap.evaluation.environments import make_env
+from sb3_sap.permissibility import APFunction, query_labels
 
 #: Actions of a box that are tried before the last one is taken, permissible or not.
 TRIES = 32
@@ -44,7 +45,7 @@ def random_permissible(env_id: str, name: str, options: dict[str, Any], seeds: l
 def _choose(env: Any, obs: Any, ap_function: APFunction, rng: np.random.Generator) -> Any:
     for action in _in_random_order(env.action_space, rng):  # the last one stays, permissible or not
         next_obs = copy.deepcopy(env).step(action)[0]
-        if ask(ap_function, "ap_function", _one(obs), np.asarray(action)[None], _one(next_obs))[0]:
+        if query_labels(ap_function, "ap_function", _one(obs), np.asarray(action)[None], _one(next_obs))[0]:
             break
     return action
 

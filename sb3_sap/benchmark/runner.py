@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sb3_sap.benchmark.cells import Cell, read_result, write_result
 from sb3_sap.benchmark.columns import Column
 from sb3_sap.benchmark.process import run_in_own_process, stop_all
-from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 
 def missing_cells(grid: dict[Column, list[Cell]], folder: Path) -> list[tuple[str, Cell]]:

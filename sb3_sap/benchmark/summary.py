@@ -19,7 +19,7 @@ from sb3_sap.benchmark.measures import (
 )
 from sb3_sap.benchmark.pages import markdown, write_csv, write_page
 from sb3_sap.benchmark.results import NoResults, Results
-from sb3_sap.statistics import interquartile_mean, probability_of_improvement
+from sb3_sap.evaluation.statistics import interquartile_mean, probability_of_improvement
 
 NOTE = (
     "Laps and S are those after the whole training, on the unseen tracks, the actor alone; S is the interquartile mean "

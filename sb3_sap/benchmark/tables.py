@@ -12,7 +12,7 @@ from sb3_sap.benchmark.pages import markdown, write_csv, write_page, write_text
 from sb3_sap.benchmark.paper import TABLE_2, paper_score
 from sb3_sap.benchmark.results import Results
 from sb3_sap.envs import TRACKS
-from sb3_sap.statistics import bootstrap_interval, interquartile_mean
+from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 NOTE = (
     "S is the total reward relative to a perfect lap; the paper's S follows from its total at the control step of "

@@ -13,9 +13,10 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_sap.algorithms import ALGORITHMS
-from sb3_sap.errors import nearest
-from sb3_sap.evaluation import make_env
-from sb3_sap.permissibility import APFunction, ask, resolve
+from sb3_sap.common.errors import nearest
+from sb3_sap.common.functions import resolve
+from sb3_sap.evaluation.environments import make_env
+from sb3_sap.permissibility import APFunction, query_labels
 from sb3_sap.presets import algorithms, load_config, settings_in
 
 #: Seeds of the evaluation episodes, the same for every run.
@@ -143,7 +144,7 @@ class Episode:
         labels: Any = self._labels
         if ap_function is not None:
             before, after = _stacked(self._observations[:-1]), _stacked(self._observations[1:])
-            labels = ask(ap_function, "ap_function", before, np.stack(self._actions), after)
+            labels = query_labels(ap_function, "ap_function", before, np.stack(self._actions), after)
         success, total = self._info.get("is_success"), round(self._total, 4)
         permissible = round(float(np.mean(labels)), 4)
         return [None if success is None else bool(success), permissible, total, total, len(labels)]

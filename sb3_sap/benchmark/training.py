@@ -18,7 +18,8 @@ from sb3_sap.benchmark.learners import make_model
 from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.rule import random_permissible
 from sb3_sap.benchmark.tasks import RETURN_COLUMNS, evaluation
-from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env, make_env
+from sb3_sap.evaluation.environments import make_env
+from sb3_sap.evaluation.laps import ENVIRONMENTS, lap, lap_env
 
 #: Steps between two points of a curve, and steps over which its reward is averaged (Fig. 4a).
 INTERVAL, WINDOW = 25, 100

@@ -10,7 +10,7 @@ import pandas as pd
 from sb3_sap.benchmark.figures import ACCURACY_STEPS, with_averages
 from sb3_sap.benchmark.measures import median_reached
 from sb3_sap.benchmark.results import Results
-from sb3_sap.statistics import interquartile_mean
+from sb3_sap.evaluation.statistics import interquartile_mean
 
 DDPG, CE1, CE2, AP, AP_CE2 = (f"{algo}:paper" for algo in ("ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap", "ddpg_ap_ce2"))
 SPEED = 50.0

@@ -6,8 +6,9 @@ import os
 
 from gymnasium.envs.registration import register
 
+from sb3_sap.envs.car import CarState, Simulator
 from sb3_sap.envs.constraints import constraint_ce1, constraint_ce2
-from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD, CarState, LaneKeepingEnv, Simulator, ap_function, score
+from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD, LaneKeepingEnv, ap_function, score
 from sb3_sap.envs.tracks import TRACKS, Track, get_track
 
 MAX_EPISODE_STEPS = 10_000

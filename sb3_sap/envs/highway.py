@@ -14,8 +14,9 @@ from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
 from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.dynamics import BicycleVehicle
 
-from sb3_sap.envs.lane_keeping import STEERING_LOCK, CarState
+from sb3_sap.envs.car import STEERING_LOCK, CarState
 from sb3_sap.envs.tracks import Piece, Track, get_track
+from sb3_sap.envs.units import KMH
 
 MIN_SPEED, MAX_SPEED = 5.0, 144.0
 """km/h. Below the first highway-env's model damps all turning; above the second it brakes."""
@@ -23,7 +24,6 @@ SUB_STEP = 0.05
 """s, longest step of the integration at 50 km/h and above (see `HighwaySimulator`)."""
 SUB_STEP_SPEED = 50.0
 """km/h. At lower speeds the sub-step shrinks in proportion."""
-KMH = 3.6
 """km/h in 1 m/s."""
 
 

@@ -1,24 +1,23 @@
 """The paper's task: keep a car on the centre line by steering alone, at a default speed.
 
-State, action, reward and AP function are those of sections 4.1 and 5.1. Where the car drives is a `Simulator`'s
-business; this module knows none by name.
+State, action, reward and AP function are those of sections 4.1 and 5.1. A `Simulator` moves the car; this module knows
+none by name.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_sap.envs.tracks import Track
+from sb3_sap.common.errors import nearest
+from sb3_sap.envs.car import CarState, Simulator
+from sb3_sap.envs.units import KMH
 
-STEERING_LOCK = 0.366519
-"""rad that the front wheels turn at steering 1, 21° (Table 1)."""
 OBSERVATION_SCALE = np.array([1.0, 1.0, 50.0, 50.0, 50.0])
 """What one unit of the observation is: angle 1 rad, trackPos 1, speedX, speedY and speedZ 50 km/h (Table 1's order)."""
 OBSERVATION_LIMIT = np.array([math.pi, 2.0, 200.0, 200.0, 200.0])
@@ -38,50 +37,6 @@ RANDOM_ANGLE = 0.2
 
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
-
-
-class CarState(NamedTuple):
-    """What the task needs to know of the car (Table 1)."""
-
-    angle: float
-    """rad, in [-pi, pi]: road heading minus yaw; positive when the car points to the right of the road.
-
-    The sign is that of TORCS' sensors: positive steering corrects a positive angle."""
-    track_pos: float
-    """2 · (distance to the left of the centre line) / width: 0 on the axis, 1 at the left edge, -1 at the right."""
-    speed_x: float
-    """km/h, along the car's longitudinal axis."""
-    speed_y: float
-    """km/h, along its transverse axis, positive to the left."""
-    speed_z: float
-    """km/h, along its vertical axis."""
-    distance: float
-    """m along the centre line from the start line, in [0, length)."""
-
-
-class Simulator(Protocol):
-    """Where the car drives: one car on one track, held at its default speed."""
-
-    track: Track
-    """Plan geometry, for the viewer."""
-    length: float
-    """m, one lap along the centre line."""
-    control_step: float
-    """s, between two actions."""
-    start: dict[str, float]
-    """Where the car starts unless told otherwise: the arguments of `reset`."""
-
-    def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
-        """Put the car on the road, as `CarState` says it, and return where it stands."""
-        ...
-
-    def step(self, steering: float) -> CarState:
-        """Drive one control step with the steering (in [-1, 1], positive to the left) held."""
-        ...
-
-    def close(self) -> None:
-        """Release what the simulator holds."""
-        ...
 
 
 def reward(state: CarState) -> float:
@@ -115,7 +70,7 @@ def score(total_reward: float, length: float, control_step: float) -> float:
     :param length: L, m
     :param control_step: Δt, s
     """
-    return total_reward / (3.6 * length / control_step)
+    return total_reward / (KMH * length / control_step)
 
 
 class LaneKeepingEnv(gym.Env[Observation, Action]):
@@ -270,9 +225,9 @@ def _checked_start(options: Mapping[str, Any], length: float) -> dict[str, float
     start = {}
     for name, value in options.items():
         if name not in bounds:
-            near = difflib.get_close_matches(str(name), bounds, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise ValueError(f"options of reset() may hold distance, track_pos and angle, got {name!r}{hint}")
+            raise ValueError(
+                f"options of reset() may hold distance, track_pos and angle, got {name!r}: {nearest(name, bounds)}"
+            )
         low, high, unit = bounds[name]
         try:
             number = float(value)

@@ -18,7 +18,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.graphics import VehicleGraphics
 from numpy.typing import NDArray
 
-from sb3_sap.envs.lane_keeping import STEERING_LOCK, CarState
+from sb3_sap.envs.car import STEERING_LOCK, CarState
 from sb3_sap.envs.tracks import Track
 
 SIZE = (600, 400)

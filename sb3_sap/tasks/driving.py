@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_sap.permissibility import BoolArray, FloatArray
+from sb3_sap.common.arrays import BoolArray, FloatArray
 
 Array = np.ndarray[Any, Any]
 

@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Runs one of the commands and returns its exit code."""
     import sys
 
-    from sb3_sap.errors import run_command
+    from sb3_sap.common.command_line import run_command
 
     arguments = sys.argv[1:] if arguments is None else arguments
     try:

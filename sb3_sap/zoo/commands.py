@@ -14,7 +14,7 @@ import rl_zoo3.enjoy
 import rl_zoo3.train
 import rl_zoo3.utils
 
-from sb3_sap.evaluation import find_environment
+from sb3_sap.evaluation.environments import find_environment
 from sb3_sap.zoo.arguments import NamedStoreDict, command_line
 from sb3_sap.zoo.configs import check_algo
 from sb3_sap.zoo.options import StudyOptions, study_parser

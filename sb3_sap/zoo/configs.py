@@ -14,10 +14,10 @@ import yaml
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sap.errors import nearest
-from sb3_sap.permissibility import resolve
+from sb3_sap.common.errors import nearest
+from sb3_sap.common.functions import resolve
+from sb3_sap.common.schedules import LINEAR
 from sb3_sap.presets import RUNNER_KEYS, algorithms
-from sb3_sap.settings import LINEAR
 
 #: What the words of an annotation admit. An annotation with any other word is left to the constructor.
 KINDS: dict[str, tuple[type, ...]] = {

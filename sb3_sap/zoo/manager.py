@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 from sb3_sap.zoo.configs import check_file, check_hyperparameters, evaluation_options, packaged
 from sb3_sap.zoo.storages import SeededByTrial, check_belongs, load_study
 

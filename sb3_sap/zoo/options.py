@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sb3_sap.benchmark.paper import TEST_TRACKS
-from sb3_sap.evaluation import ENVIRONMENTS
+from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 
 @dataclass

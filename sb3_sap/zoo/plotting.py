@@ -6,10 +6,10 @@ from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
 
-from sb3_sap.errors import nearest
+from sb3_sap.common.errors import nearest
 from sb3_sap.zoo.arguments import command_line
-from sb3_sap.zoo.report import write_report_to
 from sb3_sap.zoo.storages import load_study
+from sb3_sap.zoo.study_report import write_report_to
 
 PLOTS = ("train", "all", "file", "study")
 
@@ -43,7 +43,7 @@ def _rl_zoo3_plot(what: str, arguments: list[str], folder: Path | None) -> None:
     import matplotlib.pyplot as plt
     from rl_zoo3.plots import all_plots, plot_from_file, plot_train
 
-    from sb3_sap.plots import save
+    from sb3_sap.evaluation.plots import save
 
     if folder:
         plt.show = lambda *args, **kwargs: None

@@ -12,7 +12,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
-from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 from sb3_sap.zoo.configs import evaluation_options
 from sb3_sap.zoo.spaces import (
     convert_crossq_params,

@@ -12,11 +12,11 @@ import pandas as pd
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_sap.files import atomic_path
-from sb3_sap.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
-from sb3_sap.zoo import figures
-from sb3_sap.zoo.report import markdown_table, shown, target_name
+from sb3_sap.common.files import atomic_path
+from sb3_sap.evaluation.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
+from sb3_sap.zoo import study_plots
 from sb3_sap.zoo.storages import check_belongs, load_study, without_password
+from sb3_sap.zoo.study_report import markdown_table, shown, target_name
 from sb3_sap.zoo.tuning import StudyManager
 
 DEFAULT = "default"
@@ -98,7 +98,7 @@ class RetestManager(StudyManager):
 
 def arms(study: optuna.Study, algo: str, best: int) -> dict[str, dict[str, Any]]:
     """The default and the best trials, by name: what each changes of the configuration."""
-    done = sorted(figures.completed(study), key=lambda trial: float(trial.value or 0), reverse=True)
+    done = sorted(study_plots.completed(study), key=lambda trial: float(trial.value or 0), reverse=True)
     if not done:
         raise ValueError(f"No trial of the study {study.study_name!r} has finished.")
     winners = {f"trial {trial.number}": HYPERPARAMS_CONVERTER[algo](trial.params) for trial in done[:best]}

@@ -20,14 +20,14 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sap.exploration import ActionPermissibilityMixin
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 from sb3_sap.zoo import laps
 from sb3_sap.zoo.manager import GuidedExperimentManager
 from sb3_sap.zoo.options import StudyOptions, check_validation_tracks
-from sb3_sap.zoo.report import write_report
-from sb3_sap.zoo.reporting import ReportingCallback
 from sb3_sap.zoo.spaces import t_k_range
 from sb3_sap.zoo.storages import check_belongs, is_surplus, open_storage, without_password
+from sb3_sap.zoo.study_report import write_report
+from sb3_sap.zoo.trial_callback import ReportingCallback
 from sb3_sap.zoo.workers import SurplusTrial, count_workers, end_with_parent, run_workers, work_until
 
 

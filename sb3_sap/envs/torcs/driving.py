@@ -8,8 +8,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_sap.envs.lane_keeping import OBSERVATION_LIMIT, OBSERVATION_SCALE, CarState, LaneKeepingEnv
+from sb3_sap.envs.car import CarState
+from sb3_sap.envs.lane_keeping import OBSERVATION_LIMIT, OBSERVATION_SCALE, LaneKeepingEnv
 from sb3_sap.envs.torcs.simulator import TorcsSimulator
+from sb3_sap.envs.units import KMH
 
 LOOK_AHEAD = (5.0, 10.0, 20.0, 35.0, 55.0, 80.0, 110.0, 150.0)
 """m ahead of the car at which the road's curvature is observed."""
@@ -25,7 +27,6 @@ SURE_ANGLE, SURE_TRACK_POS = 0.2, 0.5
 """rad and half widths within which a car is well placed."""
 EDGE_TIME = 1.0
 """s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
-KMH = 3.6
 HALF_WIDTH = slice(5 + len(LOOK_AHEAD), 6 + len(LOOK_AHEAD))
 """Where the observation holds half the road's width …"""
 WIDTH_SCALE = 10.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import os
 import platform
@@ -11,6 +10,8 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
+
+from sb3_sap.common.errors import nearest
 
 LIBRARIES = Path("usr/lib/x86_64-linux-gnu")
 DATA = Path("usr/share/games/torcs")
@@ -126,7 +127,5 @@ def check_installation(root: Path) -> Installation:
 
 def _one_of(kind: str, name: str, known: dict[str, Path]) -> Path:
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(known)}."
-        raise ValueError(f"{kind} must be one that TORCS ships, got {name!r}; {hint}")
+        raise ValueError(f"{kind} must be one that TORCS ships, got {name!r}: {nearest(name, known, n=3, cutoff=0.4)}")
     return known[name]

@@ -16,31 +16,31 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_sap.envs.torcs.simulation import TICK, Simulation
+from sb3_sap.envs.torcs.physics import TICK, Physics
 from sb3_sap.envs.torcs.structures import PRESTART, RUNNING
+from sb3_sap.envs.units import KMH
 
 CONTROLS = ("steer_1", "accel_1")
-KMH = np.float32(3.6)
 
 
-def _angle(simulation: Simulation) -> np.float32:
+def _angle(simulation: Physics) -> np.float32:
     # The robot's sensors keep 32-bit floats, and wrap them with a 64-bit π.
     angle = np.float32(simulation.heading) - np.float32(simulation.pose[2])
     turns = int(angle < -math.pi) - int(angle > math.pi)
     return np.float32(float(angle) + turns * 2 * math.pi)
 
 
-def _slip(simulation: Simulation) -> np.float32:
+def _slip(simulation: Physics) -> np.float32:
     front_right, front_left, rear_right, rear_left = map(np.float32, simulation.wheel_spins)
     return (rear_left + rear_right) - (front_left + front_right)
 
 
-STATES: dict[str, Callable[[Simulation], Any]] = {
+STATES: dict[str, Callable[[Physics], Any]] = {
     "angle_rad": _angle,
     "trackPos_1": lambda simulation: simulation.track_pos,
-    "speedX_kmh": lambda simulation: np.float32(simulation.velocity[0]) * KMH,
-    "speedY_kmh": lambda simulation: np.float32(simulation.velocity[1]) * KMH,
-    "speedZ_kmh": lambda simulation: np.float32(simulation.velocity[2]) * KMH,
+    "speedX_kmh": lambda simulation: np.float32(simulation.velocity[0]) * np.float32(KMH),
+    "speedY_kmh": lambda simulation: np.float32(simulation.velocity[1]) * np.float32(KMH),
+    "speedZ_kmh": lambda simulation: np.float32(simulation.velocity[2]) * np.float32(KMH),
     "slip_rad_s": _slip,
     "x_m": lambda simulation: simulation.pose[0],
     "y_m": lambda simulation: simulation.pose[1],
@@ -85,7 +85,7 @@ def replay(trace: Path, start_conditions: Path) -> Comparison:
     conditions = _conditions(start_conditions, name)
     table = _table(trace)
     common, own = conditions["common"], conditions["trace"]
-    simulation = Simulation(
+    simulation = Physics(
         Path(own["track"]).name,
         common["car"],
         common["skill_level"],
@@ -133,7 +133,7 @@ def _controls(table: pd.DataFrame, conditions: dict[str, Any]) -> list[tuple[flo
 
 
 def _drive(
-    simulation: Simulation,
+    simulation: Physics,
     table: pd.DataFrame,
     controls: list[tuple[float, float, float, float, int]],
     grid: dict[str, Any],

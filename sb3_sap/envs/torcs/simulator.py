@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_sap.envs.lane_keeping import CarState
-from sb3_sap.envs.torcs.simulation import TICK, Simulation
-from sb3_sap.envs.torcs.throttle import KMH, PERIOD_TICKS, SpeedHolder
+from sb3_sap.envs.car import CarState
+from sb3_sap.envs.torcs.physics import TICK, Physics
+from sb3_sap.envs.torcs.throttle import PERIOD_TICKS, SpeedHolder
 from sb3_sap.envs.torcs.track_files import flatten
 from sb3_sap.envs.tracks import read_track_xml
+from sb3_sap.envs.units import KMH
 
 TRAINING_DISTANCE = 100.0
 """m before the start line, where the training start is."""
@@ -50,7 +51,7 @@ class TorcsSimulator:
         )
         if ticks < 1 or abs(ticks * TICK - control_step) > 1e-9:
             raise ValueError(f"control_step must be a positive multiple of {TICK} s, got {control_step!r}.")
-        self.simulation = Simulation(track, car)
+        self.simulation = Physics(track, car)
         self.control_step = control_step
         self.length = self.simulation.length
         self.track = read_track_xml(self.simulation.track_path)

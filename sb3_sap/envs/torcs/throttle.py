@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from sb3_sap.envs.torcs.simulation import Simulation
+from sb3_sap.envs.torcs.physics import Physics
+from sb3_sap.envs.units import KMH
 
 PERIOD_TICKS = 10
 """Ticks between two decisions, 50 Hz. Shifting cuts the throttle command, so the controls are written each time."""
@@ -22,7 +23,6 @@ SHIFT_TIME = 0.5
 """… and s for which it then stays."""
 PERIOD = 0.02
 """s"""
-KMH = 3.6
 
 
 class SpeedHolder:
@@ -41,7 +41,7 @@ class SpeedHolder:
         self._gear = 1
         self._since_shift = SHIFT_TIME
 
-    def controls(self, simulation: Simulation) -> tuple[float, float, int]:
+    def controls(self, simulation: Physics) -> tuple[float, float, int]:
         """Throttle, brake and gear for the next period."""
         lack = self.speed - simulation.velocity[0] * KMH
         if abs(lack) < self.speed / 5:  # while it accelerates from rest, nothing is learned about the throttle needed
@@ -53,7 +53,7 @@ class SpeedHolder:
         brake = min(max(BRAKE_GAIN * (-lack - BRAKE_MARGIN), 0.0), 1.0)
         return throttle, brake, self.gear(simulation)
 
-    def gear(self, simulation: Simulation) -> int:
+    def gear(self, simulation: Physics) -> int:
         """The gear of the next period, shifted by the engine's speed."""
         self._since_shift += PERIOD
         if self._since_shift >= SHIFT_TIME:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
+from sb3_sap.common.errors import nearest
 from sb3_sap.envs.tracks.files import parse_table, read_track_xml, write_table
 from sb3_sap.envs.tracks.generate import generate_track
 from sb3_sap.envs.tracks.geometry import Piece, Segment, Track
@@ -42,9 +42,8 @@ def get_track(track: str | os.PathLike[str] | Track) -> Track:
     if path.is_file():
         return read_track_xml(path) if path.suffix == ".xml" else _read_table(path)
     names = [*TRACKS, "random", "random:SEED"]
-    near = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"known are {', '.join(map(repr, names))}."
-    raise ValueError(f"track must be a known name or the path of a track file, got {name!r}; {hint}")
+    hint = nearest(name.lower(), names, n=3, cutoff=0.4)
+    raise ValueError(f"track must be a known name or the path of a track file, got {name!r}: {hint}")
 
 
 @lru_cache

@@ -1,0 +1,94 @@
+"""Whether an AP function is worth learning from, told before a training run is spent on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Integral
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_sap.check.advice import advise
+from sb3_sap.check.classifier import Foresight, foresee
+from sb3_sap.check.report import PermissibilityReport
+from sb3_sap.check.trials import label, rollout, try_actions
+from sb3_sap.common.arrays import stack_observations
+from sb3_sap.common.functions import resolve
+from sb3_sap.common.spaces import check_action_space, check_observation_space
+from sb3_sap.permissibility import APFunction
+
+
+def check_permissibility(
+    env: gym.Env[Any, Any],
+    ap_function: APFunction | str | None = None,
+    policy: Any = None,
+    n_steps: int = 2_000,
+    seed: int = 0,
+    verbose: bool = True,
+) -> PermissibilityReport:
+    """Tries an AP function out with random actions and, if there is one, with a good policy.
+
+    The environment is stepped ``n_steps`` times with random actions, as often with the policy, and further to come back
+    to a few states, by a reset with the same seed and the same actions: about 3,500 steps with one action dimension,
+    170 for each action of a finite space, and with several dimensions from 5,000, where the action always decides, to
+    21,000, where it never does. Short episodes make them fewer.
+
+    :param env: one environment, not a vector of them, with a bounded ``Box`` or a ``Discrete`` action space, and with
+        observations that SB3 takes: a ``Box``, ``Discrete``, ``MultiDiscrete``, ``MultiBinary``, or a ``Dict`` of them
+    :param ap_function: as the algorithms take it: f(s, a | s') or its dotted name; ``None``: ``info["permissible"]``
+    :param policy: a good one, with SB3's ``predict``, or a function of one observation that returns an action
+    :param n_steps: random steps, at least 100
+    :param seed: of everything random here
+    :param verbose: whether to print the report
+    :return: the report as data
+    :raise ValueError: for an environment that cannot be used, labels that are missing or of a wrong shape
+    :raise TypeError: for labels that are not bool
+    """
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"`env` must be a single Gymnasium environment, but is {env!r}.")
+    given: list[tuple[str, Any, int]] = [("n_steps", n_steps, 100), ("seed", seed, 0)]
+    for name, value, least in given:
+        if not isinstance(value, Integral) or value < least:
+            raise ValueError(f"`{name}` must be a whole number of at least {least}, but is {value!r}.")
+    check_action_space("check_permissibility", env.action_space, discrete=None)
+    check_observation_space("check_permissibility", env.observation_space)
+    function = None if ap_function is None else resolve(ap_function, "ap_function")
+    act = None if policy is None else _acting(policy, env.action_space)
+    env.action_space.seed(seed)
+    walk = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)
+    labels = label(walk, function)
+    action_matters, label_changes = try_actions(env, function, seed)
+    foresight = foresee(
+        env, stack_observations([t.obs for t in walk]), np.stack([t.action for t in walk]), labels, seed
+    )
+    findings: dict[str, Any] = {
+        "n_steps": n_steps,
+        "permissible_rate": float(labels.mean()),
+        "own_row": np.array_equal(label(walk[::-1], function)[::-1], labels),
+        "action_matters": action_matters,
+        "label_changes": label_changes,
+        **(dict.fromkeys(Foresight._fields) if foresight is None else foresight._asdict()),
+        "policy_forbidden": None,
+    }
+    if act is not None:
+        findings["policy_forbidden"] = float(1 - label(rollout(env, act, n_steps, seed), function).mean())
+    report = PermissibilityReport(**findings)
+    report = PermissibilityReport(**findings, advice=tuple(advise(report)))
+    if verbose:
+        print(report)
+    return report
+
+
+def _acting(policy: Any, space: gym.Space[Any]) -> Callable[[Any], Any]:
+    if not (hasattr(policy, "predict") or callable(policy)):
+        raise TypeError(f"`policy` must have SB3's `predict` or be a function (obs) -> action, but is {policy!r}.")
+
+    def act(obs: Any) -> Any:
+        action = policy.predict(obs, deterministic=True)[0] if hasattr(policy, "predict") else policy(obs)
+        numbers = np.asarray(action)
+        if numbers.dtype.kind not in "biuf" or numbers.shape != space.shape:
+            raise ValueError(f"`policy` must return one action of {space} for one observation, but gave {action!r}.")
+        return action
+
+    return act

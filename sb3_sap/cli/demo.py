@@ -1,0 +1,128 @@
+"""The main job in one command: learn on one track, drive the unseen ones, show what happened."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+from rich.console import Console
+
+from sb3_sap.algorithms import ALGORITHMS
+from sb3_sap.benchmark.paper import TEST_TRACKS
+from sb3_sap.cli.animation import animate
+from sb3_sap.cli.hub import EXTRAS
+from sb3_sap.cli.laps import add_simulator, drive_tracks, results_table
+from sb3_sap.cli.training_log import TrainingLog, ctrl_c_stops
+from sb3_sap.common.command_line import not_negative, positive
+from sb3_sap.common.files import atomic_path
+from sb3_sap.envs import TRACKS
+from sb3_sap.evaluation.lane_keeping_plots import learning_curve, predictor_probabilities
+from sb3_sap.evaluation.laps import ENVIRONMENTS, LapResult, write_results
+from sb3_sap.evaluation.plots import save
+from sb3_sap.presets import preset, preset_names
+
+#: km/h, the default speed of the task.
+SPEED = 50.0
+
+
+@dataclass
+class Run:
+    """What to train, where, and where to leave the results."""
+
+    algo: str = "ddpg_ap"
+    preset: str | None = None  # "fast" where there is one, else "default"
+    steps: int = 3_000
+    seed: int = 0
+    track: str = "wheel-2"
+    simulator: str = "highway"
+    out: Path = field(default_factory=lambda: Path("demo_output"))
+    animation: bool = True
+
+    @property
+    def command(self) -> str:
+        """The command that does the same again."""
+        given = {name: getattr(self, name) for name in ("algo", "preset", "steps", "seed", "track", "simulator")}
+        words = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
+        return shlex.join(["sb3-sap", "demo", *words])
+
+
+def demo(run: Run, console: Console) -> list[LapResult]:
+    """Trains, drives the test tracks and leaves model, tables and pictures in ``run.out``."""
+    env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
+    name = run.preset or ("fast" if "fast" in preset_names(run.algo) else "default")
+    settings = preset(name, run.algo, run.steps)
+    model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
+    log = TrainingLog()
+    try:
+        with ctrl_c_stops(log):
+            console.print(
+                f"[bold]{type(model).__name__}[/] learns {run.steps:,} steps on {run.track} (preset {name!r})"
+            )
+            model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
+    finally:
+        # Ctrl-C included: what was learned so far stays, but not what an earlier run left of another model.
+        for name in EXTRAS:
+            (run.out / name).unlink(missing_ok=True)
+        with atomic_path(run.out / "model.zip") as temporary:
+            model.save(temporary)
+        with atomic_path(run.out / "run.json") as temporary:
+            taken = len(log.rows)
+            command = run.command if taken >= run.steps else f"{run.command}  # interrupted after {taken} steps"
+            described = {**asdict(run), "out": str(run.out), "command": command}
+            temporary.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+        training = pd.DataFrame(log.rows)
+        with atomic_path(run.out / "training.csv") as temporary:
+            training.to_csv(temporary, index=False)
+    results = drive_tracks(model, list(TEST_TRACKS), run.simulator, console)
+    write_results(run.out / "evaluation.json", results)
+    console.print(results_table(results, run.algo, run.steps))
+    draw(run, model, training)
+    if run.animation:
+        animate(model, run.simulator, SPEED, run.out / "lap.gif", console)
+    console.print(f"Model, tables and pictures are in [bold]{run.out}/[/]")
+    return results
+
+
+def draw(run: Run, model: Any, training: pd.DataFrame) -> None:
+    """Draws the learning curve and, where there is a fitted predictor, what it believes."""
+    title = f"{type(model).__name__} on {TRACKS.get(run.track, run.track)}, seed {run.seed}"
+    save(learning_curve(training, title, getattr(model, "noise_steps", None)), run.out / "learning_curve.png")
+    predictor = getattr(model, "predictor", None)
+    if predictor is not None and predictor.fitted:
+        save(predictor_probabilities(model, SPEED), run.out / "predictor.png")
+
+
+def add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds ``sb3-sap demo``."""
+    default = Run()
+    steering = [name for name in ALGORITHMS if "dqn" not in name]  # which choose among finite actions
+    command = commands.add_parser(
+        "demo",
+        help="train a car to keep its lane, then drive the unseen tracks",
+        description="Trains on one track, drives one lap of each of the paper's four test tracks with the actor alone, "
+        "prints a table, and leaves model.zip, run.json, training.csv, evaluation.json, learning_curve.png, "
+        "predictor.png and lap.gif in the output folder.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--algo", choices=steering, default=default.algo, help="the algorithm")
+    command.add_argument(
+        "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
+    )
+    command.add_argument("--steps", type=positive, default=default.steps, help="training steps")
+    command.add_argument("--seed", type=not_negative, default=default.seed, help="seed of everything random")
+    command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
+    add_simulator(command)
+    command.add_argument("--out", type=Path, default=default.out, help="output folder")
+    command.add_argument("--animation", action=argparse.BooleanOptionalAction, default=True, help="draw lap.gif")
+    command.set_defaults(run=_demo)
+
+
+def _demo(options: argparse.Namespace, console: Console) -> int:
+    demo(Run(**{name: value for name, value in vars(options).items() if name != "run"}), console)
+    return 0

@@ -1,0 +1,1 @@
+"""What every other package here builds on; it knows neither predictor nor guidance."""

@@ -1,0 +1,37 @@
+"""Arrays and observations, which are arrays or, for a ``Dict`` space, one array per key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+
+#: A batch of observations, (n, *obs_shape), or one such array per key of a ``Dict`` space.
+Observations: TypeAlias = "np.ndarray[Any, Any] | dict[str, np.ndarray[Any, Any]]"
+BoolArray: TypeAlias = "np.ndarray[Any, np.dtype[np.bool_]]"
+FloatArray: TypeAlias = "np.ndarray[Any, np.dtype[np.floating[Any]]]"
+
+
+def copy_observation(obs: Any) -> Any:
+    """A copy of an observation or a batch: an environment may reuse its array, a user's function may write to it."""
+    return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
+
+
+def same_observation(one: Any, other: Any) -> bool:
+    """Whether two observations, or batches of them, are equal."""
+    if isinstance(one, Mapping):
+        return all(np.array_equal(one[key], other[key]) for key in one)
+    return np.array_equal(one, other)
+
+
+def rows_of(obs: Any, rows: Any) -> Any:
+    """Some rows of a batch of observations, or one."""
+    return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]
+
+
+def stack_observations(observations: list[Any]) -> Any:
+    """A batch of single observations; for a ``Dict`` space, one array per key."""
+    if isinstance(observations[0], dict):
+        return {key: np.stack([obs[key] for obs in observations]) for key in observations[0]}
+    return np.stack(observations)

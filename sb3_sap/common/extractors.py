@@ -1,0 +1,59 @@
+"""What the networks see of an observation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+from sb3_sap.common.functions import resolve
+
+
+class RescaleExtractor(FlattenExtractor):
+    """A flat observation with each bounded entry brought to [-1, 1]; E takes it over from the policy.
+
+    SB3's networks get a bounded observation as it is. Where one entry spans a small part of what another does, such as
+    the velocity of MountainCar, they can hardly tell its values apart, and an actor saturates before it has learnt to.
+    The AP function and whatever else is the user's goes on seeing the observation itself.
+
+    ``policy_kwargs={"features_extractor_class": RescaleExtractor}``, in YAML ``sb3_sap.RescaleExtractor``.
+
+    :param observation_space: a Box; its unbounded entries stay as they are
+    """
+
+    scale: th.Tensor
+    shift: th.Tensor
+
+    def __init__(self, observation_space: spaces.Box):
+        if not isinstance(observation_space, spaces.Box) or is_image_space(observation_space):
+            raise ValueError(
+                f"RescaleExtractor is for arrays of numbers, but the observation space is {observation_space}: leave "
+                "`features_extractor_class` out, or wrap the environment."
+            )
+        super().__init__(observation_space)
+        # In single precision "bounds" of ±3e38, which stand for none, are infinitely far apart.
+        with np.errstate(over="ignore", invalid="ignore"):
+            low, high = (bound.astype(np.float32) for bound in (observation_space.low, observation_space.high))
+            half, middle = (high - low) / 2, (high + low) / 2
+        bounded = np.isfinite(half) & (half > 0)
+        self.register_buffer("scale", th.as_tensor(np.where(bounded, half, 1.0), dtype=th.float32))
+        self.register_buffer("shift", th.as_tensor(np.where(bounded, middle, 0.0), dtype=th.float32))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward((observations - self.shift) / self.scale)
+
+
+def with_extractor(policy_kwargs: Any) -> dict[str, Any]:
+    """A copy of ``policy_kwargs`` in which a features extractor may be named, as in YAML."""
+    if policy_kwargs is not None and not isinstance(policy_kwargs, Mapping):
+        raise TypeError(f"`policy_kwargs` and `predictor_kwargs` must be dictionaries, but one is {policy_kwargs!r}.")
+    arguments = dict(policy_kwargs or {})
+    name = "features_extractor_class"
+    if name in arguments:
+        arguments[name] = resolve(arguments[name], name)
+    return arguments

@@ -1,0 +1,54 @@
+"""The car of the lane-keeping task, and what a simulator must provide to move it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from sb3_sap.envs.tracks import Track
+
+STEERING_LOCK = 0.366519
+"""rad that the front wheels turn at steering 1, 21° (Table 1)."""
+
+
+class CarState(NamedTuple):
+    """What the task needs to know of the car (Table 1)."""
+
+    angle: float
+    """rad, in [-pi, pi]: road heading minus yaw; positive when the car points to the right of the road.
+
+    The sign is that of TORCS' sensors: positive steering corrects a positive angle."""
+    track_pos: float
+    """2 · (distance to the left of the centre line) / width: 0 on the axis, 1 at the left edge, -1 at the right."""
+    speed_x: float
+    """km/h, along the car's longitudinal axis."""
+    speed_y: float
+    """km/h, along its transverse axis, positive to the left."""
+    speed_z: float
+    """km/h, along its vertical axis."""
+    distance: float
+    """m along the centre line from the start line, in [0, length)."""
+
+
+class Simulator(Protocol):
+    """Where the car drives: one car on one track, held at its default speed."""
+
+    track: Track
+    """Plan geometry, for the viewer."""
+    length: float
+    """m, one lap along the centre line."""
+    control_step: float
+    """s, between two actions."""
+    start: dict[str, float]
+    """Where the car starts unless told otherwise: the arguments of `reset`."""
+
+    def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
+        """Put the car on the road, as `CarState` says it, and return where it stands."""
+        ...
+
+    def step(self, steering: float) -> CarState:
+        """Drive one control step with the steering (in [-1, 1], positive to the left) held."""
+        ...
+
+    def close(self) -> None:
+        """Release what the simulator holds."""
+        ...

@@ -1,0 +1,84 @@
+"""The predictor as an action filter at run time: what the policy proposes is checked before it is executed."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import torch as th
+
+from sb3_sap.common.torch_utils import flush_denormals
+from sb3_sap.common.vec_envs import environment_layout, policy_layout, unnormalized
+from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
+from sb3_sap.guidance.candidates import candidate_actions, choose
+from sb3_sap.predictor.network import candidate_logits
+
+
+class GuidedPolicy:
+    """Predicts as a guided model with ``guided=True``, for tools that take a model, such as ``evaluate_policy``.
+
+    :param model: any guided algorithm
+    """
+
+    def __init__(self, model: Any):
+        if not hasattr(model, "predictor"):
+            raise TypeError(f"`model` must be a guided model, such as a TQCAP, but is a {type(model).__name__}.")
+        self.model = model
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray[Any, Any], Any]:
+        """The model's ``predict`` with ``guided=True``."""
+        actions, state = self.model.predict(observation, state, episode_start, deterministic, guided=True)
+        return actions, state
+
+
+@th.no_grad()
+@flush_denormals()
+def guided_prediction(
+    model: GuidedExplorationMixin, observation: Any, actions: np.ndarray[Any, Any]
+) -> np.ndarray[Any, Any]:
+    """Replaces each action that is not permissible by the nearest permissible candidate, if there is any.
+
+    The same observation always gives the same action: the candidates are drawn with a seed of their own. ``alpha`` and
+    ``constraint``, which needs the previous action, are ignored; E is queried once it was fitted.
+
+    :param observation: one, or a batch, as ``predict`` takes it
+    :param actions: what the policy proposes, in the environment's units
+    """
+    obs, is_batch = model.policy.obs_to_tensor(observation)
+    shape = cast(Any, model.action_space).shape
+    env = model.get_vec_normalize_env()
+    if env is None and model.learned_normalised and model.permissible_actions is not None:
+        raise ValueError(
+            "`permissible_actions` judges observations as the environment gives them, but this model takes normalised "
+            "ones and has no statistics to undo that: load it with its VecNormalize, `load(path, env=...)`."
+        )
+    seen = policy_layout(observation, model.observation_space)
+    if not is_batch:
+        seen = {key: value[None] for key, value in seen.items()} if isinstance(seen, dict) else seen[None]
+    raw = environment_layout(seen if env is None else unnormalized(env, seen, model.observation_space), model.images)
+    proposed = np.asarray(actions).reshape(-1, *shape)
+    if not model.discrete:
+        proposed = model.policy.scale_action(proposed)
+    flat = proposed.reshape(len(proposed), -1)
+    ones = np.ones_like(flat[:1])
+    candidates = candidate_actions(np.random.default_rng(0), model.action_space, -ones, ones, model.n_candidates)
+    candidates = candidates.repeat(len(flat), axis=0)  # the same beside others in a batch
+    # The proposal itself comes first and is its own nearest candidate.
+    candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
+    permissible = model.allowed_candidates(raw, candidates)
+    if model.predictor.fitted:
+        permissible &= candidate_logits(model.predictor, model.predictor.features(obs), candidates) > 0
+    found = permissible.any(axis=1)
+    if not found.any():
+        return actions
+    distance = np.linalg.norm(candidates - flat[:, None], axis=2)
+    flat = flat.copy()
+    flat[found] = choose(model.exploration_rng, candidates[found], permissible[found], -distance[found])
+    changed = (flat != proposed.reshape(flat.shape)).any(axis=1)
+    if not changed.any():
+        return actions
+    guided = np.array(actions).reshape(proposed.shape)
+    guided[changed] = model.unscale_actions(flat.reshape(proposed.shape))[changed]
+    return guided.reshape(np.shape(actions))

@@ -1,0 +1,86 @@
+"""The permissible actor loss: what E knows, taught to the actor itself. It goes beyond the paper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+from torch.nn import functional as F
+
+from sb3_sap.common.torch_utils import flush_denormals
+from sb3_sap.guidance.values import action_values
+from sb3_sap.predictor.network import PermissibilityPredictor
+
+
+@flush_denormals()
+def permissible_actor_step(
+    actor: Any,
+    predictor: PermissibilityPredictor,
+    replay_buffer: ReplayBuffer,
+    coef: float,
+    batch_size: int,
+    env: VecNormalize | None = None,
+) -> float:
+    """One gradient step of the actor on β · softplus(−E(s, μ(s))), E itself held fixed.
+
+    This is the cross-entropy of the actor's own action under the predictor, had it been labelled permissible. An
+    optimal action is permissible by Definition 3, so under a perfect E the term vanishes at the optimum.
+
+    :param actor: with its ``optimizer``; of a stochastic one the mean action counts, so that its entropy is left alone
+    :param coef: β
+    :param batch_size: states drawn from the replay buffer
+    :param env: normalises the states, if given
+    :return: the loss before the step
+    """
+    observations = replay_buffer.sample(batch_size, env=env).observations
+    # An extra pass must not move running statistics (CrossQ's batch renormalisation).
+    actor.set_training_mode(False)
+    stochastic = hasattr(actor, "action_log_prob")
+    actions: th.Tensor = actor(observations, deterministic=True) if stochastic else actor(observations)
+    loss = coef * F.softplus(-predictor(observations, actions)).mean()
+    actor.optimizer.zero_grad()
+    trained = [parameter for parameter in actor.parameters() if parameter.requires_grad]  # some may be frozen
+    if trained:
+        loss.backward(inputs=trained)  # type: ignore[no-untyped-call]
+    actor.optimizer.step()
+    return loss.item()
+
+
+@flush_denormals()
+def permissible_value_step(
+    model: Any,
+    predictor: PermissibilityPredictor,
+    replay_buffer: ReplayBuffer,
+    coef: float,
+    batch_size: int,
+    env: VecNormalize | None = None,
+) -> float:
+    """The same for finite actions, where the largest value acts: one gradient step on β · softplus(Q(s, a) − Q(s, b)).
+
+    a is each action that E rejects, b the best that it permits: the cross-entropy of preferring b. What guidance
+    keeps from being executed is never corrected by experience: where rewards are negative, an unknown action looks
+    better than all that is known. By Definition 3 no optimal policy takes it, so its value is free. Both values move,
+    because lowering one alone lowers all that share its features, without end.
+
+    :param model: DQN or QR-DQN
+    :return: the loss before the step; 0 where E does not tell the actions of any state apart
+    """
+    observations = replay_buffer.sample(batch_size, env=env).observations
+    model.policy.set_training_mode(False)
+    values = action_values(model, observations)  # (n, k)
+    n, k = values.shape
+    with th.no_grad():
+        every = th.arange(k, device=values.device).repeat(n, 1)
+        features = predictor.features(observations).repeat_interleave(k, dim=0)
+        rejected = (predictor.logits(features, every.flatten()) <= 0).reshape(n, k)
+    best = values.masked_fill(rejected, -th.inf).max(dim=1, keepdim=True).values
+    told = rejected & best.isfinite()
+    if not told.any():
+        return 0.0
+    loss = coef * F.softplus(values - best)[told].mean()
+    model.policy.optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    model.policy.optimizer.step()
+    return loss.item()

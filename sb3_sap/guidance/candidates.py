@@ -1,0 +1,61 @@
+"""A_st, the actions to choose from instead of a rejected one, and how one of them is chosen (Alg. 1, lines 8 to 11)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_sap.common.arrays import BoolArray, FloatArray
+
+#: How the action to execute is chosen among the permissible candidates; "random" is the paper's.
+SELECTIONS = ("random", "nearest", "highest_q", "most_permissible")
+
+
+def candidate_actions(
+    rng: np.random.Generator, space: spaces.Space[Any], low: FloatArray, high: FloatArray, n: int
+) -> np.ndarray[Any, Any]:
+    """A_st for m states: n stratified draws from a continuous space, or every action of a finite one.
+
+    :param low: (m, action_dim) lower bounds, scaled; a finite space has no use for them
+    :param high: (m, action_dim) upper bounds
+    :return: (m, n, action_dim)
+    """
+    if isinstance(space, spaces.Discrete):
+        return np.tile(np.arange(space.n)[:, None], (len(low), 1, 1))
+    return stratified_candidates(rng, low, high, n)
+
+
+def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: FloatArray, n: int) -> FloatArray:
+    """Low-variance uniform sampling (section 4.3): one draw from each of n equal strata of every dimension.
+
+    In one dimension the candidates come in ascending order; in more, the strata of the dimensions are paired at
+    random, which is Latin hypercube sampling.
+
+    :param low: (m, action_dim) lower bounds
+    :param high: (m, action_dim) upper bounds
+    :return: (m, n, action_dim) candidates, float32
+    """
+    m, dim = low.shape
+    strata = np.broadcast_to(np.arange(n)[:, None], (m, n, dim))
+    if dim > 1:
+        strata = rng.permuted(strata, axis=1)
+    unit = (strata + rng.random((m, n, dim))) / n  # (m, n, action_dim) in [0, 1)
+    return (low[:, None] + unit * (high - low)[:, None]).astype(np.float32)
+
+
+def choose(
+    rng: np.random.Generator, candidates: np.ndarray[Any, Any], permissible: BoolArray, scores: FloatArray | None
+) -> np.ndarray[Any, Any]:
+    """One permissible candidate of each state that has any.
+
+    :param candidates: (m, n, action_dim)
+    :param permissible: (m, n), each row with at least one True
+    :param scores: (m, n), of which the highest wins; None: one at random
+    :return: (m, action_dim)
+    """
+    if scores is None:
+        return np.stack([rng.choice(row[allowed]) for row, allowed in zip(candidates, permissible, strict=True)])
+    best = np.where(permissible, scores, -np.inf).argmax(axis=1)
+    return np.asarray(candidates[np.arange(len(candidates)), best])

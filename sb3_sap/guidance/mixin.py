@@ -1,0 +1,53 @@
+"""What turns an SB3 off-policy algorithm into a guided one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sb3_sap.guidance.action_filter import guided_prediction
+from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
+
+
+class ActionPermissibilityMixin(AuxiliaryLossMixin):
+    """Guides an SB3 off-policy algorithm with a learned AP predictor (Algorithm 1).
+
+    Goes before the algorithm in the bases of a class. Each class of the chain has one task, and passes on to the next::
+
+        ActionPermissibilityMixin         predict(guided=True)
+          AuxiliaryLossMixin              the auxiliary loss of actor or Q-values
+            GuidedExplorationMixin        Algorithm 1
+              LearnedPermissibilityMixin  labels, knowledge buffer K, AP predictor E
+                WatchedEnvironmentMixin   last observations as they were; warns of foreign steps
+              ConstrainedExplorationMixin constraints and permissible actions
+        SettingsMixin                     settings that SB3 lacks
+          EnvironmentMixin                spaces, wrappers, layouts
+          SavingMixin                     what files hold
+            DDPG, TD3, SAC, TQC, ...      the base algorithm
+
+    ``predict`` remains the policy alone unless it is told otherwise, so that every evaluation tool of SB3 measures
+    what was learned; both buffers hold the action that was executed.
+
+    The parameters are those of :class:`~sb3_sap.guidance.algorithm1.GuidedExplorationMixin`,
+    :class:`~sb3_sap.guidance.auxiliary_update.AuxiliaryLossMixin`,
+    :class:`~sb3_sap.predictor.mixin.LearnedPermissibilityMixin`,
+    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin` and
+    :class:`~sb3_sap.common.settings.SettingsMixin`, beside those of the base algorithm.
+    """
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray[Any, Any], ...] | None = None,
+        episode_start: np.ndarray[Any, Any] | None = None,
+        deterministic: bool = False,
+        guided: bool = False,
+    ) -> tuple[np.ndarray[Any, Any], tuple[np.ndarray[Any, Any], ...] | None]:
+        """SB3's ``predict``.
+
+        :param guided: replace an action that ``permissible_actions`` or E rejects by the nearest that they accept
+            (:func:`~sb3_sap.guidance.action_filter.guided_prediction`)
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        return (guided_prediction(self, observation, actions) if guided else actions), state

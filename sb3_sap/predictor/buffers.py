@@ -1,0 +1,166 @@
+"""The replay buffers R that feed the knowledge buffer K as well."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_sap.common.vec_envs import RAW_LAST, environment_layout
+from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
+from sb3_sap.predictor.knowledge import KnowledgeBuffer
+
+
+class KnowledgeMixin(ReplayBuffer):
+    """Makes any SB3 replay buffer R feed K as well; K is saved and loaded with it.
+
+    :param knowledge: K, filled with every transition added
+    :param ap_function: labels the transitions; without it the label is taken from ``info["permissible"]``
+    """
+
+    #: The images that the AP function sees channels last (:func:`~sb3_sap.common.vec_envs.channels_last`).
+    images: tuple[str, ...] = ()
+    #: Whether a transition without a label is an error; else it is left out of K.
+    needs_labels: bool = True
+
+    def __init__(
+        self, *args: Any, knowledge: KnowledgeBuffer | None = None, ap_function: APFunction | None = None, **kwargs: Any
+    ):
+        if knowledge is None:
+            raise TypeError(
+                f"A {type(self).__name__} needs `knowledge=KnowledgeBuffer(...)`, which a guided algorithm gives it: "
+                "if this came from loading a model, load it with the class that saved it, such as `DDPGAP.load`."
+            )
+        super().__init__(*args, **kwargs)
+        self.knowledge = knowledge
+        self.ap_function = ap_function
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray[Any, Any],
+        reward: np.ndarray[Any, Any],
+        done: np.ndarray[Any, Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # SB3 hands over raw observations, and the true last one of an episode: here a label is right.
+        for i, info in enumerate(infos):
+            if RAW_LAST in info:
+                _put(next_obs, i, info[RAW_LAST])
+        if self.ap_function is not None:
+            before, after = (environment_layout(o, self.images) for o in (obs, next_obs))
+            labels = query_labels(self.ap_function, "ap_function", before, self._unscale(action), after)
+        elif self.needs_labels or any("permissible" in info for info in infos):
+            labels = labels_from_infos(infos)
+        else:
+            labels = None
+        if labels is not None:
+            self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        if not isinstance(self.action_space, spaces.Box):
+            return action
+        low, high = self.action_space.low, self.action_space.high
+        return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The AP function is the model's; the file holds data alone.
+        return {**super().__getstate__(), "ap_function": None}  # type: ignore[dict-item]
+
+
+class PermissibilityReplayBuffer(KnowledgeMixin, ReplayBuffer):
+    """SB3's replay buffer R that also feeds K."""
+
+
+class PermissibilityDictReplayBuffer(KnowledgeMixin, DictReplayBuffer):
+    """The same for ``Dict`` observations."""
+
+
+class PermissibilityNStepReplayBuffer(KnowledgeMixin, NStepReplayBuffer):
+    """The same with n-step returns."""
+
+
+class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
+    """The same with hindsight goals; K keeps the goals that were pursued."""
+
+
+#: What takes the place of each of SB3's buffers in a guided algorithm.
+GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
+    ReplayBuffer: PermissibilityReplayBuffer,
+    DictReplayBuffer: PermissibilityDictReplayBuffer,
+    NStepReplayBuffer: PermissibilityNStepReplayBuffer,
+    HerReplayBuffer: PermissibilityHerReplayBuffer,
+}
+
+
+def _put(observations: Any, row: int, obs: Any) -> None:
+    """Writes one observation into a batch."""
+    if isinstance(observations, dict):
+        for key, batch in observations.items():
+            batch[row] = obs[key]
+    else:
+        observations[row] = obs
+
+
+def guided_buffer_class(
+    requested: type[ReplayBuffer] | None, observation_space: spaces.Space[Any], n_steps: int
+) -> type[KnowledgeMixin]:
+    """The buffer class that SB3 would have chosen, or that the user asked for, in the form that feeds K."""
+    # A saved model names the class that its own n_steps led to; `load` may be given others.
+    if requested is None or requested is PermissibilityReplayBuffer:
+        plain = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
+        requested = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else plain
+    guided = GUIDED_BUFFERS.get(requested, requested)
+    if not issubclass(guided, KnowledgeMixin):
+        known = ", ".join(cls.__name__ for cls in GUIDED_BUFFERS)
+        raise ValueError(
+            f"`replay_buffer_class` = {requested.__name__} does not feed the knowledge buffer: use one of {known}, "
+            f"or derive your own as `class Mine(KnowledgeMixin, {requested.__name__})`."
+        )
+    if n_steps > 1 and not issubclass(guided, NStepReplayBuffer):
+        raise ValueError(
+            f"`n_steps` = {n_steps} cannot be combined with {requested.__name__}, which knows one-step returns alone: "
+            "use `n_steps=1`, or array observations and no `replay_buffer_class`."
+        )
+    return guided
+
+
+def check_fits(loaded: ReplayBuffer, model: Any) -> None:
+    """Refuses a loaded buffer that a model cannot go on with.
+
+    :raise TypeError: if it holds no K
+    :raise ValueError: if it comes from another environment, or from another number of them
+    """
+    if not isinstance(loaded, KnowledgeMixin):
+        raise TypeError(
+            f"The file holds a plain {type(loaded).__name__} without a knowledge buffer: "
+            f"load one saved by {type(model).__name__}."
+        )
+    if loaded.n_envs != model.n_envs:
+        raise ValueError(
+            f"The file holds a replay buffer of {loaded.n_envs} environments, but this model has {model.n_envs}: "
+            "load the model with as many environments, or go on with an empty buffer."
+        )
+    own = model.replay_buffer
+    for name in ("n_steps", "gamma"):
+        if getattr(loaded, name, None) != getattr(own, name, None):
+            raise ValueError(
+                f"The file holds a replay buffer with {name} = {getattr(loaded, name, None)}, but this model's has "
+                f"{getattr(own, name, None)}: load the model with the `n_steps` and `gamma` of the buffer."
+            )
+    if isinstance(loaded, HerReplayBuffer) != isinstance(own, HerReplayBuffer):
+        raise ValueError(
+            f"The file holds a {type(loaded).__name__}, but this model uses a {type(own).__name__}: load the model "
+            "with the `replay_buffer_class` of the buffer."
+        )
+    for name in ("observation_space", "action_space"):
+        if getattr(loaded, name) != getattr(model, name):
+            raise ValueError(
+                f"The file holds a replay buffer whose {name} is {getattr(loaded, name)}, but this model's is "
+                f"{getattr(model, name)}: load one that was saved in the same environment."
+            )

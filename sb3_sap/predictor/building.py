@@ -1,0 +1,123 @@
+"""Builds the predictor, the knowledge buffer and the replay buffer of a guided model from its settings."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_sap.common.extractors import with_extractor
+from sb3_sap.common.random import make_rng
+from sb3_sap.predictor.buffers import KnowledgeMixin, guided_buffer_class
+from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.network import PermissibilityPredictor
+
+#: Unless it is told otherwise, E extracts features from observations as the policy does.
+SHARED = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
+#: Arguments of the predictor that its saved weights and optimizer depend on.
+ARCHITECTURE = (
+    "net_arch",
+    "activation_fn",
+    "features_extractor_class",
+    "features_extractor_kwargs",
+    "normalize_images",
+    "optimizer_class",
+)
+#: Keys that a hindsight replay buffer needs in an observation.
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[PermissibilityPredictor, dict[str, Any]]:
+    """E with the model's ``predictor_kwargs``, and a description of its architecture.
+
+    :param saved: the description of a saved predictor whose weights will be loaded; empty: there is none
+    :raise TypeError: for unknown arguments
+    :raise ValueError: for another architecture than the saved one
+    """
+    own = with_extractor(model.predictor_kwargs)
+    if "features_extractor_class" in own:  # which the other's arguments would not fit
+        own = {"features_extractor_kwargs": {}, **own}
+    arguments = {name: getattr(model.policy, name) for name in SHARED} | own
+    known = inspect.signature(PermissibilityPredictor).parameters
+    for name in arguments.keys() - known.keys():
+        raise TypeError(
+            f"`predictor_kwargs` holds {name!r}, but PermissibilityPredictor takes {', '.join(list(known)[2:])}."
+        )
+    architecture = {name: described(arguments.get(name, known[name].default)) for name in ARCHITECTURE}
+    changed = [name for name in ARCHITECTURE if saved.get(name, architecture[name]) != architecture[name]]
+    if changed:
+        raise ValueError(
+            f"`predictor_kwargs` change {', '.join(changed)} of a saved predictor, whose weights and optimizer "
+            f"fit no other: build a new {type(model).__name__} with them, and give it the loaded policy with "
+            "`new.policy.load_state_dict(loaded.policy.state_dict())`."
+        )
+    # A network of our own must not shift the global generator, or runs would no longer compare to the base's.
+    with th.random.fork_rng(devices=[]):
+        th.default_generator.manual_seed(int(make_rng(model.seed, "predictor").integers(2**31)))
+        predictor = PermissibilityPredictor(model.observation_space, model.action_space, **arguments)
+    return predictor.to(model.device), architecture
+
+
+def make_knowledge(model: Any) -> KnowledgeBuffer:
+    """An empty K of the model's size.
+
+    :raise ValueError: if it has no room for ``min_per_class`` examples of each class
+    """
+    knowledge = KnowledgeBuffer(
+        model.observation_space,
+        int(np.prod(model.action_space.shape or (1,))),
+        model.knowledge_buffer_size,
+        model.validation_fraction,
+        model.seed,
+        model.min_per_class,
+    )
+    room = knowledge.parts["train"].capacity // 2
+    if model.min_per_class > room:
+        raise ValueError(
+            f"`min_per_class` = {model.min_per_class} can never be reached: `knowledge_buffer_size` = "
+            f"{model.knowledge_buffer_size} has room for {room} training examples of each class."
+        )
+    return knowledge
+
+
+def make_replay_buffer(model: Any) -> KnowledgeMixin:
+    """An empty R that feeds an empty K, of the class that SB3 would have chosen or that the user asked for."""
+    buffer_class = guided_buffer_class(model.replay_buffer_class, model.observation_space, model.n_steps)
+    kwargs: dict[str, Any] = dict(model.replay_buffer_kwargs)
+    if issubclass(buffer_class, NStepReplayBuffer):
+        kwargs = {"n_steps": model.n_steps, "gamma": model.gamma, **kwargs}
+    if issubclass(buffer_class, HerReplayBuffer):
+        kwargs["env"] = model.env
+        missing = set(GOAL_KEYS).difference(getattr(model.observation_space, "spaces", {}))
+        if missing:
+            raise ValueError(
+                f"`replay_buffer_class` = {buffer_class.__name__} needs Dict observations with "
+                f"{', '.join(GOAL_KEYS)}, but {', '.join(sorted(missing))} is missing in "
+                f"{model.observation_space}: leave it out, or use an environment with goals."
+            )
+    return buffer_class(
+        model.buffer_size,
+        model.observation_space,
+        model.action_space,
+        device=model.device,
+        n_envs=model.n_envs,
+        optimize_memory_usage=model.optimize_memory_usage,
+        knowledge=make_knowledge(model),
+        **kwargs,
+    )
+
+
+def described(value: Any) -> Any:
+    """An argument of a network in words and numbers, which stay the same when a model is saved and loaded."""
+    if isinstance(value, Mapping):
+        return {str(key): described(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [described(inner) for inner in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    return getattr(value, "__qualname__", type(value).__qualname__)

@@ -1,0 +1,183 @@
+"""The knowledge buffer K of labelled actions (section 4.2)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_sap.common.arrays import FloatArray, Observations
+from sb3_sap.common.errors import is_number
+from sb3_sap.common.files import atomic_path
+from sb3_sap.common.random import make_rng
+from sb3_sap.predictor.slots import ClassSlots
+
+NON_PERMISSIBLE, PERMISSIBLE = 0, 1
+CLASSES = (NON_PERMISSIBLE, PERMISSIBLE)
+#: Observations, at most, among which a typical one is looked for.
+TYPICAL = 1_000
+Part = Literal["train", "validation"]
+
+
+class LabelledActions(NamedTuple):
+    """A balanced sample of K: n rows, half of them permissible."""
+
+    observations: Observations  # (n, *obs_shape)
+    actions: np.ndarray[Any, Any]  # (n, action_dim), scaled to [-1, 1]
+    labels: FloatArray  # (n,) 1 where permissible, else 0
+
+
+class KnowledgeBuffer:
+    """K: a finite store of (s, a, l(a)), split into training and validation examples (sections 4.2 and 5.1).
+
+    Observations are kept raw, as SB3's replay buffer keeps them, and normalised when sampled.
+
+    :param observation_space: of the environment
+    :param action_dim: length of one stored action
+    :param size: capacity; the paper's is 10,000
+    :param validation_fraction: share kept for validation; the paper's 9:1 is 0.1
+    :param seed: of the generator that splits and samples
+    :param min_per_class: in each part, tuples of a class that the other class makes room for
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_dim: int,
+        size: int = 10_000,
+        validation_fraction: float = 0.1,
+        seed: int | None = None,
+        min_per_class: int = 1,
+    ):
+        if not (is_number(validation_fraction) and 0 < validation_fraction < 1):
+            raise ValueError(f"`validation_fraction` must lie between 0 and 1, but is {validation_fraction!r}.")
+        n_validation = round(size * validation_fraction)
+        if min(n_validation, size - n_validation) < 2:
+            raise ValueError(
+                f"`knowledge_buffer_size` = {size} with `validation_fraction` = {validation_fraction} leaves no room "
+                "for both classes in each part: both the training and the validation part need at least 2 places."
+            )
+        self.size = size
+        self.validation_fraction = validation_fraction
+        self.seed(seed)
+        self.seen = [0, 0]  # (non-permissible, permissible) tuples ever added
+        capacities = {"train": size - n_validation, "validation": n_validation}
+        self.parts = {part: ClassSlots(capacity, min_per_class) for part, capacity in capacities.items()}
+        # The validation part lies behind the training part in the same arrays.
+        self._offset = {"train": 0, "validation": size - n_validation}
+        self._keyed = isinstance(observation_space, spaces.Dict)
+        keyed_spaces = (
+            observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
+        )
+        self.observations = {k: np.zeros((size, *(s.shape or ())), s.dtype) for k, s in keyed_spaces.items()}
+        self.actions = np.zeros((size, action_dim), dtype=np.float32)
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts.values())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What pickle writes: of the arrays only the rows that hold something, which are the first of each part."""
+        filled = self._filled()
+        rows = {key: store[filled] for key, store in self.observations.items()}
+        return {**vars(self), "observations": rows, "actions": self.actions[filled]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        filled = self._filled()
+
+        def whole(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+            if len(rows) == self.size:  # all of it is filled, or an earlier version wrote it in full
+                return rows
+            store = np.zeros((self.size, *rows.shape[1:]), rows.dtype)
+            store[filled] = rows
+            return store
+
+        self.observations = {key: whole(rows) for key, rows in self.observations.items()}
+        self.actions = whole(self.actions)
+
+    def save(self, path: str | Path) -> None:
+        """Writes K as SB3 writes a replay buffer, with pickle; only its filled rows take space."""
+        with atomic_path(Path(path)) as temporary:
+            save_to_pkl(temporary, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads what :meth:`save` wrote, which runs code that the file contains: load only files that you trust."""
+        loaded = load_from_pkl(path)
+        if not isinstance(loaded, cls):
+            raise TypeError(f"{path} holds no knowledge buffer but a {type(loaded).__name__}.")
+        return loaded
+
+    def _filled(self) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """The rows that hold a tuple."""
+        parts: tuple[Part, Part] = ("train", "validation")
+        return np.concatenate([self._offset[part] + np.arange(len(self.parts[part])) for part in parts])
+
+    def seed(self, seed: int | None) -> None:
+        """Restarts the generator that splits and samples."""
+        self.rng = make_rng(seed, "knowledge")
+
+    def counts(self, part: Part) -> tuple[int, int]:
+        """Number of (non-permissible, permissible) tuples in a part."""
+        non_permissible, permissible = self.parts[part].counts
+        return non_permissible, permissible
+
+    def add(self, obs: Observations, actions: np.ndarray[Any, Any], labels: np.ndarray[Any, Any]) -> None:
+        """Adds n labelled actions.
+
+        :param obs: (n, *obs_shape), raw
+        :param actions: (n, action_dim), scaled
+        :param labels: (n,) bool
+        """
+        keyed = obs if isinstance(obs, dict) else {"": obs}
+        for i, label in enumerate(labels):
+            part: Part = "validation" if self.rng.random() < self.validation_fraction else "train"
+            slot = self._offset[part] + self.parts[part].claim(int(label))
+            for key, store in self.observations.items():
+                store[slot] = keyed[key][i]
+            self.actions[slot] = actions[i]
+            self.seen[int(label)] += 1
+
+    def typical_observation(self) -> Any:
+        """The raw observation of K that lies nearest to the median of them; None where there is none.
+
+        A median itself need not be any possible state, such as the sine and cosine of an angle.
+        """
+        slots = np.concatenate([self.parts["train"].slots(label) for label in CLASSES])
+        if len(slots) == 0:
+            return None
+        slots = slots[:: math.ceil(len(slots) / TYPICAL)]
+        distance = np.zeros(len(slots))
+        for store in self.observations.values():
+            rows = store[slots].reshape(len(slots), -1).astype(np.float64)
+            spread = rows.std(axis=0)
+            distance += (np.abs(rows - np.median(rows, axis=0)) / np.where(spread > 0, spread, 1)).sum(axis=1)
+        nearest = slots[distance.argmin()]
+        row = {key: store[nearest].copy() for key, store in self.observations.items()}
+        return row if self._keyed else row[""]
+
+    def sample(
+        self, n: int, part: Part = "train", env: VecNormalize | None = None, balanced: bool = True
+    ) -> LabelledActions:
+        """Draws D_E, balanced and stratified: n // 2 tuples of each class, with replacement, in random order.
+
+        :param env: normalises the observations, if given
+        :param balanced: False draws every tuple with the same probability
+        """
+        n_permissible = n // 2
+        if not balanced:
+            n_permissible = int(self.rng.binomial(2 * (n // 2), self.counts(part)[PERMISSIBLE] / len(self.parts[part])))
+        sizes = (2 * (n // 2) - n_permissible, n_permissible)
+        chosen = [self.rng.choice(self.parts[part].slots(label), sizes[label]) for label in CLASSES]
+        slots = self._offset[part] + np.concatenate(chosen)
+        labels = np.repeat(np.array(CLASSES, dtype=np.float32), sizes)
+        order = self.rng.permutation(len(slots))
+        slots, labels = slots[order], labels[order]
+        rows = {key: store[slots] for key, store in self.observations.items()}
+        obs: Observations = rows if self._keyed else rows[""]
+        return LabelledActions(obs if env is None else env.normalize_obs(obs), self.actions[slots], labels)

@@ -1,0 +1,216 @@
+"""The AP predictor E(s, a): a binary classifier that predicts permissibility (section 4.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, create_mlp
+from stable_baselines3.common.utils import obs_as_tensor
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_sap.common.arrays import FloatArray
+from sb3_sap.common.torch_utils import flush_denormals
+from sb3_sap.predictor.knowledge import LabelledActions
+
+#: Balanced validation accuracy from which E is accurate enough for α; below it, ``alpha_low`` holds (section 4.3).
+SUFFICIENT_ACCURACY = 0.7
+
+
+class PermissibilityPredictor(BaseModel):
+    """E(s, a | θ_E): the logit that action a is permissible in state s.
+
+    It sees observations as the policy sees them, and actions scaled to [-1, 1] or, of a finite space, one-hot.
+
+    :param observation_space: of the environment
+    :param action_space: of the environment
+    :param net_arch: hidden layers; the paper's are 128 and 256
+    :param activation_fn: between them
+    :param learning_rate: of its optimizer
+    :param weight_decay: λ of Eq. (7)
+    :param batch_size: of one gradient step
+    :param optimizer_class: a ``torch.optim`` class or its name, such as ``"SGD"``
+    :param optimizer_kwargs: its further arguments
+    :param features_extractor_class: as in SB3's policies; E owns its extractor
+    :param features_extractor_kwargs: its arguments
+    :param normalize_images: as in SB3's policies
+    """
+
+    features_extractor: BaseFeaturesExtractor
+    n_updates: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        net_arch: tuple[int, ...] | list[int] = (128, 256),
+        activation_fn: type[nn.Module] = nn.ReLU,
+        learning_rate: float = 1e-3,
+        weight_decay: float = 1e-4,
+        batch_size: int = 128,
+        optimizer_class: type[th.optim.Optimizer] | str = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+    ):
+        if isinstance(optimizer_class, str):
+            found = getattr(th.optim, optimizer_class, None)
+            if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
+                raise ValueError(
+                    f"`optimizer_class` = {optimizer_class!r} names no optimizer of torch.optim, such as 'Adam'."
+                )
+            optimizer_class = found
+        _check_arguments(net_arch, batch_size, learning_rate)
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+        self.batch_size = batch_size
+        self._arguments = {
+            "net_arch": list(net_arch),
+            "activation_fn": activation_fn,
+            "learning_rate": learning_rate,
+            "weight_decay": weight_decay,
+            "batch_size": batch_size,
+        }
+        self.features_extractor = self.make_features_extractor()
+        n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
+        self.head = nn.Sequential(*create_mlp(n_inputs, 1, list(net_arch), activation_fn))
+        self._normalises_batches = any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in self.modules())
+        # Seeds the random layers, such as dropout, of each fit.
+        self._seed = th.initial_seed()
+        # Buffers are saved with the weights: a loaded E knows whether it was ever fitted.
+        self.register_buffer("n_updates", th.zeros((), dtype=th.long))
+        # The gradient of the L2 term λ/2 ‖θ_E‖² is λ θ_E, which torch.optim calls weight decay.       # Eq. (7)
+        self.optimizer = optimizer_class(
+            self.parameters(),
+            lr=learning_rate,  # type: ignore[call-arg]
+            weight_decay=weight_decay,
+            **self.optimizer_kwargs,
+        )
+        # Only a fit needs training mode; all else queries E, sometimes for a single state.
+        self.set_training_mode(False)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """What ``save`` writes beside the weights, so that ``load`` builds the same network."""
+        return {
+            **super()._get_constructor_parameters(),
+            **self._arguments,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+            "features_extractor_class": self.features_extractor_class,
+            "features_extractor_kwargs": self.features_extractor_kwargs,
+        }
+
+    @property
+    def fitted(self) -> bool:
+        """Whether E has seen any example; Algorithm 1 does not query it before."""
+        return bool(self.n_updates)
+
+    def features(self, obs: Any) -> th.Tensor:
+        """(n, features_dim) features of n observation tensors."""
+        return self.extract_features(obs, self.features_extractor)
+
+    def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """(n,) logits of (n, action_dim) actions; above zero means permissible."""
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = F.one_hot(actions.flatten().long(), int(self.action_space.n))
+        # A float64 action space brings float64 actions.
+        return self.head(th.cat([features, actions.to(features.dtype)], dim=1)).squeeze(1)  # type: ignore[no-any-return]
+
+    def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
+        """(n,) logits of n observations and (n, action_dim) scaled actions."""
+        return self.logits(self.features(obs), actions)
+
+    def loss(self, obs: Any, actions: th.Tensor, labels: th.Tensor) -> th.Tensor:
+        """Binary cross-entropy of (n,) labels in {0, 1}; the optimizer adds the L2 term."""
+        return F.binary_cross_entropy_with_logits(self(obs, actions), labels)  # Eq. (7)
+
+    @flush_denormals()
+    def fit(self, dataset: LabelledActions) -> float:
+        """One pass of mini-batch gradient descent over D_E, whose rows come in random order.
+
+        :return: mean loss over the mini-batches
+        """
+        obs, actions, labels = self._to_tensors(dataset)
+        losses = []
+        with self._training():
+            for batch in self._batches(len(labels)):
+                obs_batch = {key: value[batch] for key, value in obs.items()} if isinstance(obs, dict) else obs[batch]
+                loss = self.loss(obs_batch, actions[batch], labels[batch])
+                self.optimizer.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                self.optimizer.step()
+                losses.append(loss.item())
+        self.n_updates += len(losses)
+        return float(np.mean(losses))
+
+    @contextmanager
+    def _training(self) -> Iterator[None]:
+        """Training mode for a while, whose random layers leave the global generators alone."""
+        cuda = self.device.type == "cuda"
+        seed = (self._seed + int(self.n_updates)) % 2**63
+        with th.random.fork_rng(devices=[self.device] if cuda else []):
+            th.default_generator.manual_seed(seed)
+            if cuda:
+                th.cuda.manual_seed(seed)
+            self.set_training_mode(True)
+            try:
+                yield
+            finally:
+                self.set_training_mode(False)
+
+    def _batches(self, n: int) -> Iterator[slice]:
+        """Mini-batches of n rows."""
+        starts = list(range(0, n, self.batch_size))
+        if self._normalises_batches and n % self.batch_size == 1 and len(starts) > 1:
+            starts.pop()  # a row on its own has no variance: it goes with those before it
+        for start, end in zip(starts, [*starts[1:], n], strict=True):
+            yield slice(start, end)
+
+    @th.no_grad()
+    @flush_denormals()
+    def recall(self, dataset: LabelledActions) -> tuple[float, float]:
+        """Share of each class that E gets right, (non-permissible, permissible): their mean is balanced accuracy."""
+        obs, actions, labels = self._to_tensors(dataset)
+        correct = ((self(obs, actions) > 0) == (labels > 0.5)).cpu().numpy()
+        permissible = dataset.labels > 0.5
+        return float(correct[~permissible].mean()), float(correct[permissible].mean())
+
+    def _to_tensors(self, dataset: LabelledActions) -> tuple[Any, th.Tensor, th.Tensor]:
+        obs: Any = obs_as_tensor(dataset.observations, self.device)
+        actions, labels = (th.as_tensor(array, device=self.device) for array in dataset[1:])
+        return obs, actions, labels
+
+
+def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None:
+    if not isinstance(net_arch, (list, tuple)) or not all(isinstance(n, Integral) and int(n) > 0 for n in net_arch):
+        raise ValueError(f"`net_arch` must be a list of the widths of hidden layers, but is {net_arch!r}.")
+    if not (isinstance(batch_size, Integral) and int(batch_size) > 0):
+        raise ValueError(f"`batch_size` must be a whole number of at least 1, but is {batch_size!r}.")
+    if not (isinstance(learning_rate, Real) and float(learning_rate) >= 0):
+        raise ValueError(f"`learning_rate` of the predictor must be a number of at least 0, but is {learning_rate!r}.")
+
+
+def candidate_logits(
+    predictor: PermissibilityPredictor, features: th.Tensor, candidates: np.ndarray[Any, Any]
+) -> FloatArray:
+    """E's (m, n) logits of (m, n, action_dim) candidates in m states of (m, features_dim) features, in one call."""
+    m, n, dim = candidates.shape
+    actions = th.as_tensor(candidates.reshape(m * n, dim), device=features.device)
+    logits = predictor.logits(features.repeat_interleave(n, dim=0), actions)
+    return logits.cpu().numpy().reshape(m, n)

@@ -1,0 +1,55 @@
+"""Which slots of a store hold which class, and which slot a new example takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class ClassSlots:
+    """Which slots of a full or filling store belong to which class, oldest first.
+
+    When the store is full, a new tuple replaces the oldest of its class; of a class that has too few, the oldest of
+    the other, which is then the larger one.
+
+    :param capacity: number of slots
+    :param least: tuples of a class below which it grows, at most half of the capacity
+    """
+
+    def __init__(self, capacity: int, least: int = 1):
+        self.capacity = capacity
+        self.least = max(1, min(least, capacity // 2))
+        self.counts = [0, 0]
+        self._slots = np.zeros((2, capacity), dtype=np.int64)
+        self._oldest = [0, 0]
+
+    def __len__(self) -> int:
+        return sum(self.counts)
+
+    def slots(self, label: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """The slots that hold a tuple of class ``label``, in no promised order."""
+        return self._slots[label, : self.counts[label]]
+
+    def claim(self, label: int) -> int:
+        """The slot for a new tuple of class ``label``."""
+        if len(self) < self.capacity:
+            return self._append(label, len(self))
+        if self.counts[label] < self.least:
+            return self._append(label, self._remove_oldest(1 - label))
+        position = self._oldest[label]
+        self._oldest[label] = (position + 1) % self.counts[label]
+        return int(self._slots[label, position])
+
+    def _append(self, label: int, slot: int) -> int:
+        # Only classes that have never wrapped, or have just been put in order, grow: the newest is also the last.
+        self._slots[label, self.counts[label]] = slot
+        self.counts[label] += 1
+        return slot
+
+    def _remove_oldest(self, label: int) -> int:
+        in_age_order = np.roll(self.slots(label), -self._oldest[label])
+        self.counts[label] -= 1
+        self._slots[label, : self.counts[label]] = in_age_order[1:]
+        self._oldest[label] = 0
+        return int(in_age_order[0])

@@ -1,4 +1,4 @@
-"""The algorithms a user names: the paper's DDPG-AP and its baselines (section 5.1), and every other off-policy base."""
+"""The algorithms: the paper's DDPG-AP and its baselines (section 5.1), and the same for other off-policy bases."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.constraints import ActionConstraint
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 
-#: The lane-keeping rules of section 5.1, by name: the algorithms know no environment.
+#: The lane-keeping constraints of section 5.1, by name, because the algorithms import no environment.
 CE1 = "sb3_sap.envs.constraint_ce1"
 CE2 = "sb3_sap.envs.constraint_ce2"
 
 
 class DDPG(ConstrainedExplorationMixin, PlainDDPG):
     """SB3's DDPG with the settings of :class:`~sb3_sap.common.settings.SettingsMixin` and
-    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`; without them equal to the bit.
+    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`; without them it equals SB3's to the bit.
     """
 
 
@@ -43,14 +43,14 @@ class DDPGCE1(DDPG):
 
 
 class DDPGCE2(DDPG):
-    """DDPG-CE2: the rule of DDPG-CE1, while the car moves away from the centre line."""
+    """DDPG-CE2: the constraint of DDPG-CE1, applied only while the car moves away from the centre line."""
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
         super().__init__(*args, constraint=constraint, **kwargs)
 
 
 class DDPGAPCE2(DDPGAP):
-    """DDPG-(AP+CE2): the rule of DDPG-CE2 bounds the actions, and the candidates that E filters."""
+    """DDPG-(AP+CE2): the constraint of DDPG-CE2 bounds the actions and the candidates that E filters."""
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE2, **kwargs: Any):
         super().__init__(*args, constraint=constraint, **kwargs)
@@ -61,7 +61,7 @@ class TD3AP(ActionPermissibilityMixin, TD3):
 
 
 class SACAP(ActionPermissibilityMixin, SAC):
-    """SAC guided by action permissibility. Its policy explores by itself, before t_k and after."""
+    """SAC guided by action permissibility. Its stochastic policy explores without action noise."""
 
     stochastic_policy: ClassVar[bool] = True
 
@@ -79,7 +79,7 @@ class CrossQAP(ActionPermissibilityMixin, CrossQ):
 
 
 class DQNAP(ActionPermissibilityMixin, DQN):
-    """DQN guided by action permissibility: A_st is every action. Its ε-greedy choice is guided, too."""
+    """DQN guided by action permissibility: A_st is every action, and the ε-greedy choice is guided, too."""
 
     stochastic_policy: ClassVar[bool] = True
 
@@ -90,8 +90,7 @@ class QRDQNAP(ActionPermissibilityMixin, QRDQN):
     stochastic_policy: ClassVar[bool] = True
 
 
-#: Every algorithm by its RL Zoo name. Commands, the zoo and its search spaces read this table: a further algorithm is
-#: one line here and one file in ``zoo_configs``.
+#: Every algorithm by its RL Zoo name, for commands, the zoo and its search spaces.
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
     "ddpg": DDPG,
     "ddpg_ce1": DDPGCE1,

@@ -14,8 +14,8 @@ from sb3_sap.common.arrays import BoolArray, Observations, copy_observation
 class APFunction(Protocol):
     """Labels a batch of executed actions, Definition 3.
 
-    Its word against an action must be certain: an action labelled False can never be part of an optimal
-    solution. An action labelled True is merely not known to be bad.
+    An action that is labelled False can never be part of an optimal solution; one that is labelled True is
+    merely not known to be bad.
 
     :param obs: s, raw (never normalised) observations, (n, *obs_shape)
     :param actions: a, in the units of the environment's action space, (n, *action_shape)
@@ -87,7 +87,7 @@ def query_labels(
 
 
 def labels_from_infos(infos: list[dict[str, Any]]) -> BoolArray:
-    """Collects the labels that environments or :class:`ActionPermissibility` left in ``info["permissible"]``.
+    """Collects the labels that environments or :class:`ActionPermissibility` put into ``info["permissible"]``.
 
     :param infos: one ``info`` of each environment
     :return: (n_envs,) bool

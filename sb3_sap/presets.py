@@ -10,7 +10,7 @@ import yaml
 
 from sb3_sap.common.errors import is_number, nearest
 
-#: Keys of RL Zoo's format that tell its runner, not the algorithm's constructor, what to do.
+#: Keys of RL Zoo's format that are for its runner, not for the algorithm's constructor.
 RUNNER_KEYS = frozenset(
     {
         "callback",
@@ -27,9 +27,9 @@ RUNNER_KEYS = frozenset(
         "vec_env_wrapper",
     }
 )
-#: The paper chose t_k by the length of the run: up to so many steps, entries named ``<preset>-3k`` hold.
+#: The paper chooses t_k by the length of the run: up to this many steps, the entry ``<preset>-3k`` applies.
 SHORT_RUN = 3_000
-#: What the name of a Gymnasium environment looks like; presets have no such names.
+#: Entries named like a Gymnasium environment are not presets.
 _ENVIRONMENT = re.compile(r"/|-v\d+$")
 
 
@@ -48,7 +48,7 @@ def load_config(algo: str) -> dict[str, dict[str, Any]]:
 
 
 def preset_names(algo: str | type) -> list[str]:
-    """The presets of an algorithm: the entries that are no environments, the constructor's own settings among them.
+    """The presets of an algorithm, ``"default"`` among them: the entries that are not named after an environment.
 
     :param algo: the algorithm, a class of this package or its RL Zoo name
     """
@@ -59,8 +59,8 @@ def preset_names(algo: str | type) -> list[str]:
 def preset(name: str, algo: str | type | None = None, steps: int | None = None) -> dict[str, Any]:
     """Constructor arguments: ``TQCAP("MlpPolicy", env, **preset("fast", TQCAP))``.
 
-    :param name: ``"paper"``, the values of section 5.1; ``"fast"``, what learns lane keeping soonest; ``"tuned"``, a
-        peer's best on lane keeping; or ``"default"``, the constructor's own
+    :param name: ``"paper"``, the values of section 5.1; ``"fast"``, what learns lane keeping soonest; ``"tuned"``, the
+        best settings of a baseline on lane keeping; or ``"default"``, the constructor's own
     :param algo: the algorithm, a class of this package, one derived from it, or its RL Zoo name; ``None`` for the
         paper's preset alone, which is DDPG-AP's
     :param steps: planned length of the training; None: the preset's own

@@ -46,8 +46,8 @@ def versions():
 def algorithms():
     """Each of them learns; a guided one fits its predictor, is saved, loaded and drawn."""
     for name, algorithm in ALGORITHMS.items():
-        finite = name in ("dqn_ap", "qrdqn_ap")
-        env = gym.make("MountainCar-v0", max_episode_steps=50) if finite else gym.make(LANE)
+        discrete = name in ("dqn_ap", "qrdqn_ap")
+        env = gym.make("MountainCar-v0", max_episode_steps=50) if discrete else gym.make(LANE)
         settings = {"learning_starts": 50, "policy_kwargs": {"net_arch": [16]}, "tensorboard_log": "boards"}
         guided = issubclass(algorithm, ActionPermissibilityMixin)
         if guided:
@@ -57,7 +57,7 @@ def algorithms():
                 "refit_growth": 0.05,
                 "predictor_kwargs": {"net_arch": [16]},
             }
-            settings |= {"ap_function": MOUNTAIN_CAR if finite else None}  # lane keeping labels its steps itself
+            settings |= {"ap_function": MOUNTAIN_CAR if discrete else None}  # lane keeping labels its steps itself
         model = algorithm("MlpPolicy", Monitor(env, f"monitors/{name}"), seed=1, **settings).learn(STEPS)
         model.save(name)
         loaded = algorithm.load(name)

@@ -156,7 +156,7 @@ def test_it_ends_with_guidance_unless_it_has_a_rhythm_of_its_own(monkeypatch, gr
     assert max(steps) == last
 
 
-# ------------------------------------------------------------------ finite actions
+# ------------------------------------------------------------------ discrete actions
 
 
 class Permits:
@@ -172,13 +172,13 @@ class Permits:
         return th.where((features[:, 0] > 0) & ~th.isin(actions, self.actions), -1.0, 1.0)
 
 
-def finite(algorithm, **settings):
+def discrete(algorithm, **settings):
     return build(algorithm, Line(n_actions=3), predictor_gradient_steps=-1, **settings).learn(60)
 
 
 @pytest.mark.parametrize("algorithm", DISCRETE)
 def test_rejected_values_sink_below_the_best_permitted(algorithm):
-    model = finite(algorithm)
+    model = discrete(algorithm)
     model.policy.optimizer = th.optim.SGD(model.policy.parameters(), lr=0.5)
     net = model.q_net if algorithm is DQNAP else model.quantile_net
     before, target = weights(net), weights(model.policy)
@@ -203,7 +203,7 @@ def test_rejected_values_sink_below_the_best_permitted(algorithm):
 
 @pytest.mark.parametrize("permitted", [(), (0, 1, 2)])
 def test_where_e_tells_no_actions_apart_nothing_moves(permitted):
-    model = finite(DQNAP)
+    model = discrete(DQNAP)
     before = weights(model.policy)
     assert permissible_value_step(model, Permits(*permitted), model.replay_buffer, coef=1.0, batch_size=32) == 0.0
     assert same(weights(model.policy), before)
@@ -221,7 +221,7 @@ def test_it_teaches_the_values_what_e_knows(algorithm):
 
 
 def test_values_are_taught_while_learning_and_zero_changes_no_bit():
-    plain, zero, some = (finite(QRDQNAP, actor_permissibility_coef=coef) for coef in (0.0, lambda _: 0.0, 1.0))
+    plain, zero, some = (discrete(QRDQNAP, actor_permissibility_coef=coef) for coef in (0.0, lambda _: 0.0, 1.0))
     assert same(weights(plain.policy), weights(zero.policy))
     assert not same(weights(plain.policy), weights(some.policy))
     assert action_values(some, th.zeros(5, 2)).shape == (5, 3)

@@ -226,7 +226,7 @@ def test_an_environment_that_does_not_exist():
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Box(-10, 10, (1,), np.int32), "floating-point numbers.*cut down to whole numbers"),
+        (spaces.Box(-10, 10, (1,), np.int32), "floating-point numbers.*truncated to whole numbers"),
         (spaces.Box(0, 255, (2,), np.uint8), "floating-point numbers"),
         (spaces.Box(-F32.max, F32.max, (1,), np.float32), r"scaled to \[-1, 1\] and back.*too large"),
         (spaces.Box(np.float32([-1, -3e38]), np.float32([1, 3e38])), "scaled to"),
@@ -263,7 +263,7 @@ def with_observations(space):
         (with_actions(spaces.Discrete(3, start=-1)), r"actions that count from 0.*lambda a: a \+ -1.*Discrete\(3\)"),
         (with_actions(spaces.MultiDiscrete([2, 2])), "no off-policy algorithm of SB3 takes it"),
         (with_actions(spaces.MultiBinary(3)), "no off-policy algorithm of SB3 takes it"),
-        (with_actions(spaces.Box(-1, 1, (1,))), r"finite \(Discrete\).*such as SACAP"),
+        (with_actions(spaces.Box(-1, 1, (1,))), r"discrete \(Discrete\).*such as SACAP"),
         (with_observations(spaces.Discrete(4, start=1)), "observations count from 0.*subtract `start`"),
         (with_observations(spaces.MultiDiscrete([3, 3], start=[0, 1])), "observations count from 0"),
         (with_observations(spaces.Dict(a=spaces.Discrete(4, start=1))), "the entry 'a' of its observation space"),
@@ -274,7 +274,7 @@ def with_observations(space):
     ids=str,
 )
 @pytest.mark.parametrize("algorithm", [DQNAP, RuledDQN])
-def test_spaces_that_finite_actions_and_sb3_cannot_use(algorithm, env, message):
+def test_spaces_that_discrete_actions_and_sb3_cannot_use(algorithm, env, message):
     with pytest.raises(ValueError, match=f"^{algorithm.__name__} needs .*{message}"):
         build(algorithm, env)
 

@@ -143,7 +143,7 @@ def test_episodes_run_side_by_side_as_they_would_alone():
     assert together == [row for seed in episodes for row in rows_of(act, episodes=(seed,))]
 
 
-def test_finite_actions_and_goals():
+def test_discrete_actions_and_goals():
     [row] = rows_of(lambda obs: np.where(obs[:, 1] >= 0, 2, 0), "MountainCar-v0", "dqn", ("10000",))
     assert row["total_reward"] == -row["steps"] > -200
     [row] = rows_of(lambda obs: np.zeros((len(obs["observation"]), 2)), "parking-v0", "tqc", ("10000",))

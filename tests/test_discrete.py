@@ -1,4 +1,4 @@
-"""The guided algorithms of finite action spaces: what differs from the continuous ones, by hand."""
+"""The guided algorithms of discrete action spaces: what differs from the continuous ones, by hand."""
 
 import numpy as np
 import pytest
@@ -146,10 +146,10 @@ def test_normalised_observations(algorithm):
 
 @pytest.mark.parametrize("space", [spaces.Box(-1, 1, (1,)), spaces.MultiDiscrete([2, 2])], ids=str)
 @every_algorithm
-def test_action_space_must_be_finite(algorithm, space):
+def test_action_space_must_be_discrete(algorithm, space):
     env = Line()
     env.action_space = space
-    with pytest.raises(ValueError, match=rf"^{algorithm.__name__} needs an `env` with a finite \(Discrete\) action"):
+    with pytest.raises(ValueError, match=rf"^{algorithm.__name__} needs an `env` with a discrete \(Discrete\) action"):
         build(algorithm, env)
 
 

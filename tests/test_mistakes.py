@@ -269,7 +269,7 @@ CONSTRUCTORS = [
 
 SPACES = [
     Row("env", having(env=Line(n_actions=3)), ValueError, r"^DDPGAP needs an `env` with a continuous .*choose DQNAP"),
-    Row("env", having(DQNAP, env=Line()), ValueError, r"^DQNAP needs an `env` with a finite .*such as SACAP"),
+    Row("env", having(DQNAP, env=Line()), ValueError, r"^DQNAP needs an `env` with a discrete .*such as SACAP"),
     Row("env", having(env=Line(high=np.inf)), ValueError, "are bounded, .*RescaleAction or set finite bounds"),
     Row("env", having(env=with_spaces(spaces.MultiBinary(2))), ValueError, "no off-policy algorithm of SB3 takes it"),
     Row("env", having(env=Line(low=-9, high=9, action_dtype=np.int64)), ValueError, "so make its dtype np.float32"),

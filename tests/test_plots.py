@@ -89,7 +89,7 @@ def test_axes_are_named_as_in_code():
     assert plot_permissibility(goal, ("observation", 1)).axes[0].get_xlabel() == "observation[1]"
 
 
-def test_finite_actions():
+def test_discrete_actions():
     model = linear_model([0.0, 0.0, 1.0, 2.0, 3.0], DQNAP)
     image, values, actor = mesh(plot_permissibility(model, limits=(-1, 1)))
     assert image[:, 0] == pytest.approx(sigmoid([1, 2, 3]))

@@ -11,18 +11,18 @@ from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
 RARE = 0.02
 #: Examples of each class that a model wants before E is fitted: the default of ``min_per_class``.
 MIN_PER_CLASS = 20
-#: Changes of the label along one dimension of the action from which it is called rough.
+#: Number of changes of the label along one action dimension above which it is hard to learn.
 ROUGH = 4.0
 #: Share of states below which the action decides too rarely for guidance to have a choice.
 FEW = 0.1
 #: Accuracy below which what a classifier gains from the action, or loses without one of its dimensions, is noise.
 NOISE = 0.02
-#: Share of a good policy's actions whose prohibition is small print or an alarm.
+#: Share of a good policy's actions above which their prohibition is serious.
 ALARM = 0.1
 
 
 def advise(report: PermissibilityReport) -> Iterator[str]:
-    """What to look into, the gravest first."""
+    """What to look into, the most serious first."""
     rate = report.permissible_rate
     if rate in (0, 1):
         every = "permissible" if rate == 1 else "non-permissible"
@@ -34,7 +34,7 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
         return
     if not report.own_row:
         yield (
-            "Asked again with the rows in another order, the AP function gave other labels: it must be a function of "
+            "Called again with the rows in another order, the AP function gave other labels: it must be a function of "
             "each row alone, without randomness, memory, or statistics over the batch, and must not write into its "
             "arguments."
         )
@@ -54,7 +54,7 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
     if report.action_matters is not None and report.action_matters < FEW and not seen:
         yield (
             f"At {percent(report.action_matters)} of the states that were tried does the label depend on the action: "
-            "elsewhere no other action would have been better, so that guidance has nothing to choose. Label what the "
+            "elsewhere every action has the same label, so that guidance has no choice. Label what the "
             "action itself changed, such as a difference between next_obs and obs, or judge the action by what it does "
             "to a velocity."
         )

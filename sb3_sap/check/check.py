@@ -1,4 +1,4 @@
-"""Whether an AP function is worth learning from, told before a training run is spent on it."""
+"""Checks whether an AP function is worth learning from, before a training run is spent on it."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def check_permissibility(
     seed: int = 0,
     verbose: bool = True,
 ) -> PermissibilityReport:
-    """Tries an AP function out with random actions and, if there is one, with a good policy.
+    """Tries an AP function with random actions and, if one is given, with a good policy.
 
     The environment is stepped ``n_steps`` times with random actions, as often with the policy, and further to come back
     to a few states, by a reset with the same seed and the same actions: about 3,500 steps with one action dimension,
-    170 for each action of a finite space, and with several dimensions from 5,000, where the action always decides, to
-    21,000, where it never does. Short episodes make them fewer.
+    170 for each action of a ``Discrete`` space, and with several dimensions between 5,000, where the action always
+    decides, and 21,000, where it never does. Short episodes reduce these numbers.
 
     :param env: one environment, not a vector of them, with a bounded ``Box`` or a ``Discrete`` action space, and with
         observations that SB3 takes: a ``Box``, ``Discrete``, ``MultiDiscrete``, ``MultiBinary``, or a ``Dict`` of them
     :param ap_function: as the algorithms take it: f(s, a | s') or its dotted name; ``None``: ``info["permissible"]``
     :param policy: a good one, with SB3's ``predict``, or a function of one observation that returns an action
     :param n_steps: random steps, at least 100
-    :param seed: of everything random here
+    :param seed: of all random draws
     :param verbose: whether to print the report
     :return: the report as data
     :raise ValueError: for an environment that cannot be used, labels that are missing or of a wrong shape

@@ -1,4 +1,4 @@
-"""How well labels of random steps can be foreseen from (obs, action), and what the action tells: a quick E."""
+"""How well a quickly fitted E predicts the labels of random steps, and how much of that is due to the action."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ N_SHUFFLES = 5
 
 
 class FlattenEntries(BaseFeaturesExtractor):
-    """Every entry of a ``Dict``, flattened, side by side; images of any size and layout among them."""
+    """Concatenates all entries of a ``Dict``, flattened; images may have any size and layout."""
 
     def __init__(self, observation_space: spaces.Dict):
         super().__init__(observation_space, sum(get_flattened_obs_dim(s) for s in observation_space.spaces.values()))
@@ -46,7 +46,7 @@ class Foresight(NamedTuple):
 def foresee(
     env: gym.Env[Any, Any], obs: Observations, actions: np.ndarray[Any, Any], labels: BoolArray, seed: int
 ) -> Foresight | None:
-    """Fits E as a model fits it, on a part of the examples, and looks at the others; None: a class is too rare.
+    """Fits E as a model does, on a part of the examples, and measures it on the others; None: a class is too rare.
 
     :param obs: (n, *obs_shape), raw
     :param actions: (n, *action_shape), in the environment's units
@@ -78,7 +78,7 @@ def foresee(
 
 def _classifier(env: gym.Env[Any, Any], seed: int, **optimizer_kwargs: Any) -> PermissibilityPredictor:
     keyed = isinstance(env.observation_space, spaces.Dict)
-    with th.random.fork_rng(devices=[]):  # the caller's generator is left alone
+    with th.random.fork_rng(devices=[]):  # without touching the caller's generator
         th.default_generator.manual_seed(seed)
         return PermissibilityPredictor(
             env.observation_space,

@@ -19,13 +19,13 @@ class PermissibilityReport:
     permissible_rate: float
     """Share of random actions that are labelled permissible."""
     own_row: bool
-    """Whether each label depends on its own transition alone, and is the same when asked twice."""
+    """Whether each label depends on its own transition alone, and is the same in a second call."""
     action_matters: float | None
     """Share of fixed states at which some of the actions are permissible and others are not; with several dimensions
     they are tried together. ``None``: the environment cannot be brought back to a state."""
     label_changes: float | None
     """Mean number of changes of the label along a sweep of one action dimension, at the states where it changes at all:
-    1 is a threshold, 2 an interval. ``None`` for finite action spaces, too, whose actions have no order."""
+    1 is a threshold, 2 an interval. ``None`` for discrete actions, too, which have no order."""
     accuracy: float | None
     """Balanced accuracy of a quick classifier on held-out random transitions. ``None``: one of the classes is too
     rare."""
@@ -35,9 +35,9 @@ class PermissibilityReport:
     """For each dimension of the flattened action, the accuracy that the classifier loses when it is shuffled among
     the held-out transitions; about 0 where it says nothing about the label."""
     policy_forbidden: float | None
-    """Share of the policy's own actions that are labelled non-permissible; Definition 3 wants zero of a good one."""
+    """Share of the policy's own actions that are labelled non-permissible; by Definition 3 zero for a good policy."""
     advice: tuple[str, ...] = field(default=())
-    """What to look into, a sentence each; empty where nothing speaks against the AP function."""
+    """What to look into, a sentence each; empty if no problems were found."""
 
     def __str__(self) -> str:
         return _described(self)
@@ -50,14 +50,18 @@ def _described(report: PermissibilityReport) -> str:
         ("label is a function of its own row", "yes" if report.own_row else "NO", ""),
         ("states where the action decides", percent(report.action_matters), "returned to by seed and actions"),
         ("label changes along an action", _number(report.label_changes), "1 a threshold, 2 an interval"),
-        ("held-out accuracy of a classifier", percent(report.accuracy), f"the α gate wants {SUFFICIENT_ACCURACY:.0%}"),
-        ("  of one that sees no action", percent(report.accuracy_without_action), "the gap is what the action tells"),
-        ("forbidden of the policy's actions", percent(report.policy_forbidden), "Definition 3 wants 0 %"),
+        ("held-out accuracy of a classifier", percent(report.accuracy), f"the α gate is at {SUFFICIENT_ACCURACY:.0%}"),
+        (
+            "  of one that sees no action",
+            percent(report.accuracy_without_action),
+            "the difference is due to the action",
+        ),
+        ("forbidden of the policy's actions", percent(report.policy_forbidden), "0 % by Definition 3"),
     ]
     lines = [f"  {name:<36}{value:>7}   {note}".rstrip() for name, value, note in rows]
     if report.action_informs is not None and len(report.action_informs) > 1:
         lines += ["  accuracy lost when one action dimension is shuffled:", f"    {_dimensions(report.action_informs)}"]
-    advice = [f"  - {sentence}" for sentence in report.advice] or ["  Nothing speaks against this AP function."]
+    advice = [f"  - {sentence}" for sentence in report.advice] or ["  No problems found."]
     return "\n".join(["check_permissibility", *lines, *advice])
 
 

@@ -1,4 +1,4 @@
-"""What an environment answers to actions: random walks through it, and different actions in one and the same state."""
+"""Rollouts with random actions, and different actions in the same state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gymnasium import spaces
 from sb3_sap.common.arrays import BoolArray, copy_observation, same_observation, stack_observations
 from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
 
-#: States at which actions are tried: of one action dimension or a finite space, and of several dimensions.
+#: States at which actions are tried: for one action dimension or discrete actions, and for several dimensions.
 N_STATES, N_STATES_SEVERAL = 16, 24
 #: Each of them is fewer random steps than this after a reset.
 MAX_PREFIX = 20
@@ -69,7 +69,7 @@ def try_actions(env: gym.Env[Any, Any], function: APFunction | None, seed: int) 
                 return None, None
         labels = label(sweep, function)
         changes.append(int(np.count_nonzero(np.diff(labels))))
-        # One dimension rarely decides alone what several decide together.
+        # One dimension alone rarely changes a label that depends on several.
         decides.append(
             changes[-1] > 0
             or (
@@ -86,7 +86,7 @@ def try_actions(env: gym.Env[Any, Any], function: APFunction | None, seed: int) 
 
 
 def _sweep_actions(space: Any, rng: np.random.Generator) -> np.ndarray[Any, Any]:
-    """Every action of a finite space; else N_ACTIONS along one dimension, the others held at random values."""
+    """Every discrete action; otherwise N_ACTIONS along one dimension, the others held at random values."""
     if isinstance(space, spaces.Discrete):
         return np.arange(space.n)
     actions = np.repeat(np.asarray(rng.uniform(space.low, space.high))[None], N_ACTIONS, axis=0)
@@ -126,7 +126,7 @@ def _step(env: gym.Env[Any, Any], action: Any) -> tuple[Any, bool, dict[str, Any
     if not (isinstance(answer, tuple) and len(answer) == 5 and isinstance(answer[4], dict)):
         raise ValueError(
             "`env.step` must return a tuple (obs, reward, terminated, truncated, info), as Gymnasium has it, but "
-            f"returned {_kind(answer)}: tell in two values whether the episode has ended and whether it was cut short."
+            f"returned {_kind(answer)}: return separately whether the episode terminated and whether it was truncated."
         )
     obs, _, terminated, truncated, info = answer
     return obs, bool(terminated or truncated), info

@@ -1,4 +1,4 @@
-"""The main job in one command: learn on one track, drive the unseen ones, show what happened."""
+"""``sb3-sap demo``: learn on one track, drive unseen tracks, draw what happened."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import pandas as pd
@@ -66,7 +66,7 @@ def demo(run: Run, console: Console) -> list[LapResult]:
             )
             model.learn(run.steps, callback=log, progress_bar=console.is_terminal)
     finally:
-        # Ctrl-C included: what was learned so far stays, but not what an earlier run left of another model.
+        # After Ctrl-C, too, the model is saved, and files of an earlier run of another model are removed.
         for name in EXTRAS:
             (run.out / name).unlink(missing_ok=True)
         with atomic_path(run.out / "model.zip") as temporary:
@@ -101,7 +101,7 @@ def draw(run: Run, model: Any, training: pd.DataFrame) -> None:
 def add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds ``sb3-sap demo``."""
     default = Run()
-    steering = [name for name in ALGORITHMS if "dqn" not in name]  # which choose among finite actions
+    steering = [name for name, algorithm in ALGORITHMS.items() if not cast(Any, algorithm).discrete]
     command = commands.add_parser(
         "demo",
         help="train a car to keep its lane, then drive the unseen tracks",

@@ -45,7 +45,7 @@ class Trained:
 def find_trained(
     path: Path, algo: str | None, env_id: str | None, command: str | None, vecnormalize: Path | None = None
 ) -> Trained:
-    """Reads what a run left; what is given takes the place of what is found.
+    """Reads what a run saved; arguments override what is found.
 
     :param path: the output folder of ``sb3-sap demo`` or of ``sb3-sap train``, or the .zip of any model of this package
     :raise FileNotFoundError: if there is no model
@@ -108,7 +108,7 @@ def _zoo_env_kwargs(folder: Path) -> dict[str, Any]:
 def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) -> list[Path]:
     """Writes what will be uploaded into a folder, the model card last, and returns the files.
 
-    :param n_episodes: to evaluate where the run left no laps
+    :param n_episodes: to evaluate where the run saved no laps
     """
     import stable_baselines3
     from huggingface_hub import EvalResult, ModelCard, ModelCardData

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 
 class TrainingLog(BaseCallback):
-    """Collects one row of a tidy table for every training step, and ends the training when it is told to."""
+    """Collects one row of a tidy table for every training step, and ends the training once ``stop`` is set."""
 
     def __init__(self) -> None:
         super().__init__()

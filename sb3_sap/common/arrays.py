@@ -14,7 +14,7 @@ FloatArray: TypeAlias = "np.ndarray[Any, np.dtype[np.floating[Any]]]"
 
 
 def copy_observation(obs: Any) -> Any:
-    """A copy of an observation or a batch: an environment may reuse its array, a user's function may write to it."""
+    """A copy of an observation or a batch: environments may reuse their arrays, and user functions may modify them."""
     return {key: np.copy(value) for key, value in obs.items()} if isinstance(obs, Mapping) else np.copy(obs)
 
 

@@ -1,4 +1,4 @@
-"""What the networks see of an observation."""
+"""Features extractors: how networks read an observation."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from sb3_sap.common.functions import resolve
 class RescaleExtractor(FlattenExtractor):
     """A flat observation with each bounded entry brought to [-1, 1]; E takes it over from the policy.
 
-    SB3's networks get a bounded observation as it is. Where one entry spans a small part of what another does, such as
-    the velocity of MountainCar, they can hardly tell its values apart, and an actor saturates before it has learnt to.
-    The AP function and whatever else is the user's goes on seeing the observation itself.
+    SB3's networks get a bounded observation unscaled. Where one entry spans a small fraction of the range of another,
+    such as the velocity of MountainCar, they hardly distinguish its values, and an actor saturates before it learns to.
+    The AP function and the user's other functions still get the observation itself.
 
     ``policy_kwargs={"features_extractor_class": RescaleExtractor}``, in YAML ``sb3_sap.RescaleExtractor``.
 

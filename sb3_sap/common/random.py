@@ -1,4 +1,4 @@
-"""Random generators of our own, so that guidance never shifts the generators that SB3 draws from."""
+"""Separate random generators, so that guidance never shifts those that SB3 draws from."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ _STREAMS: tuple[Stream, ...] = ("exploration", "knowledge", "predictor")
 
 
 def make_rng(seed: int | None, stream: Stream) -> np.random.Generator:
-    """A generator for one purpose: the same seed gives the same draws, and different purposes different ones."""
+    """A generator for one purpose: the same seed gives the same draws, and each purpose has its own."""
     return np.random.default_rng(None if seed is None else [seed, _STREAMS.index(stream)])

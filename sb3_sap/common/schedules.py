@@ -13,7 +13,7 @@ LINEAR = r"lin_\d+\.?\d*(e-?\d+)?"
 
 
 def as_schedule(value: Any, argument: str) -> Any:
-    """A number or schedule as it is; of RL Zoo's ``"lin_<number>"`` the schedule that falls from that number to 0.
+    """Returns a number or schedule unchanged, and for RL Zoo's ``"lin_<number>"`` a schedule from that number to 0.
 
     :param argument: the name of the constructor argument, for the error message
     """

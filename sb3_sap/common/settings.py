@@ -27,8 +27,8 @@ class SettingsMixin(EnvironmentMixin, SavingMixin, OffPolicyAlgorithm):
     """Goes before an SB3 off-policy algorithm in the bases of a class.
 
     :param actor_learning_rate: of the actor alone, a number or an SB3 schedule; the paper's actor learns ten times
-        slower than its critic (section 5.1). ``None``: ``learning_rate``. A schedule may be written as in YAML, too:
-        ``"lin_0.001"`` falls evenly from 0.001 to 0 over the training
+        slower than its critic (section 5.1). ``None``: ``learning_rate``. A schedule may be written as in YAML:
+        ``"lin_0.001"`` falls linearly from 0.001 to 0 over the training
     :param action_noise: besides an SB3 ``ActionNoise``, its description as YAML can write it:
         ``{"type": "normal", "sigma": 0.1}`` or ``{"type": "ornstein-uhlenbeck", "sigma": 0.3, "theta": 0.6, "dt": 1}``
     :param policy_kwargs: SB3's; ``features_extractor_class`` may be a dotted name
@@ -46,14 +46,14 @@ class SettingsMixin(EnvironmentMixin, SavingMixin, OffPolicyAlgorithm):
         **kwargs: Any,
     ):
         self.actor_learning_rate: Any = actor_learning_rate
-        # SB3 writes into the dictionaries that it is given.
+        # SB3 writes into these dictionaries.
         kwargs["replay_buffer_kwargs"] = dict(kwargs.get("replay_buffer_kwargs") or {})
         kwargs["policy_kwargs"] = with_extractor(kwargs.get("policy_kwargs"))
         super().__init__(policy, env, *args, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
-        # The constructors here pass *args and **kwargs on; editors and API pages show the whole list.
+        # The constructors pass *args and **kwargs on; editors and API pages should show the whole list.
         cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
 
     def _setup_model(self) -> None:

@@ -1,4 +1,4 @@
-"""Which spaces the algorithms can use: refused in one sentence where SB3 would go wrong, or fail later."""
+"""Which spaces the algorithms can use; others are refused in one sentence, where SB3 would go wrong or fail later."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-#: Scaled actions that must come back unchanged, and by how much at most they may differ.
+#: Scaled actions that must survive scaling and back, and the tolerance.
 PROBES, TOLERANCE = np.linspace(-1, 1, 9), 1e-3
 #: Observations, and entries of a ``Dict`` of them, for which SB3 has networks.
 OBSERVATIONS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -20,7 +20,7 @@ def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool 
     :param discrete: whether it needs a ``Discrete`` space, or a ``Box``; None: it takes either
     :raise ValueError: with one sentence
     """
-    kinds = {True: "finite (Discrete)", False: "continuous (Box)", None: "bounded Box or a Discrete"}
+    kinds = {True: "discrete (Discrete)", False: "continuous (Box)", None: "bounded Box or a Discrete"}
     wanted = {True: (spaces.Discrete,), False: (spaces.Box,), None: (spaces.Box, spaces.Discrete)}
     if not isinstance(space, wanted[discrete]):
         raise ValueError(
@@ -53,8 +53,8 @@ def _check_box(algorithm: str, space: spaces.Box) -> None:
     needs = f"{algorithm} needs an `env` whose actions"
     if not np.issubdtype(space.dtype, np.floating):
         raise ValueError(
-            f"{needs} are floating-point numbers, but this one's action space is {space}: what it executes would be "
-            "cut down to whole numbers unnoticed, so make its dtype np.float32 and round inside the environment."
+            f"{needs} are floating-point numbers, but this one's action space is {space}: its actions would be "
+            "truncated to whole numbers unnoticed, so make its dtype np.float32 and round inside the environment."
         )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise ValueError(
@@ -80,7 +80,7 @@ def _check_box(algorithm: str, space: spaces.Box) -> None:
 
 
 def check_observation_space(algorithm: str, space: spaces.Space[Any], key: str = "") -> None:
-    """Refuses observations that SB3 cannot take, or takes for others.
+    """Refuses observations that SB3 cannot use, or would misread.
 
     :param algorithm: its name, for the error message
     :raise ValueError: with one sentence

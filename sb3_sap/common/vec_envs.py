@@ -1,4 +1,4 @@
-"""What an environment itself observed, seen through SB3's wrappers of vectorised environments."""
+"""What an environment itself observed, read through SB3's wrappers of vectorised environments."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def unwrapped(env: VecEnv) -> VecEnv:
 
 
 def check_wrappers(env: VecEnv) -> None:
-    """Refuses wrappers in an order in which SB3's off-policy algorithms mix up normalised and raw observations.
+    """Refuses wrappers in an order for which SB3's off-policy algorithms confuse normalised and raw observations.
 
     :raise ValueError: with one sentence
     """
@@ -93,7 +93,7 @@ def policy_layout(obs: Any, space: Any) -> Any:
 
 
 def unnormalized(normalize: VecNormalize, obs: Any, space: Any) -> Any:
-    """Raw observations as near as normalised ones tell them, in the type of the environment's own.
+    """Raw observations, as far as they can be recovered from normalised ones, in the environment's dtype.
 
     :param obs: a batch, as VecNormalize gave it
     :param space: the environment's
@@ -109,7 +109,7 @@ def _as_dtype(values: Any, dtype: Any) -> Any:
 
 
 def is_at(env: VecEnv, normalize: VecNormalize | None, obs: Any, raw_obs: Any) -> bool:
-    """Whether environments are, as far as can be seen, still where a model left them.
+    """Whether environments are still in the states in which a model last saw them, as far as can be observed.
 
     :param obs: the last observations that the model saw
     :param raw_obs: the same before VecNormalize
@@ -136,13 +136,13 @@ def _identities(env: object) -> set[int]:
 def watched_steps(env: VecEnv, normalize: VecNormalize | None) -> Iterator[list[int]]:
     """Follows the steps of a vectorised environment within a ``with`` block.
 
-    Each episode's last observation is left in ``info`` as it was before VecNormalize, which SB3 otherwise computes
-    back from a rounded and clipped one. Nothing is added to the wrappers, because SB3 compares them with those of
-    evaluation environments.
+    Puts each episode's last observation, as it was before VecNormalize, into ``info``; SB3 would invert the
+    normalisation of a rounded and clipped one. Nothing is added to the wrappers, because SB3 compares them with those
+    of evaluation environments.
 
     :param env: the model's
     :param normalize: its VecNormalize, if there is one
-    :return: a list whose only entry is the number of steps and resets so far, whoever asked for them
+    :return: a list whose only entry is the number of steps and resets so far, whoever called them
     """
     inner = env if normalize is None else normalize.venv
     calls = [0]

@@ -1,4 +1,4 @@
-"""An eye on the training environment: what it observed itself, who else steps it, and whether it is the right one."""
+"""Watches the training environment: its own observations, foreign steps, and whether it normalises as before."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sb3_sap.common.vec_envs import is_at, never_updated, shares_environment, wa
 
 
 class WatchedEnvironmentMixin(SettingsMixin):
-    """Keeps each episode's last observation as it was, and warns of what would mislead the buffers unnoticed."""
+    """Gives the buffers each episode's last observation as it was, and warns of what would corrupt them unnoticed."""
 
     def __init__(self, *args: Any, **kwargs: Any):
-        #: Whether the observations of the last training were normalised.
+        #: Whether observations were normalised in the last training.
         self.learned_normalised = False
         self._warned_of_sharing = False
         super().__init__(*args, **kwargs)
@@ -56,7 +56,7 @@ class WatchedEnvironmentMixin(SettingsMixin):
         return every
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """SB3's ``collect_rollouts``, with last observations as they were; steps of others are noticed."""
+        """SB3's ``collect_rollouts``, with raw last observations, and a warning of steps by others."""
         before = self.num_timesteps
         with watched_steps(env, self._vec_normalize_env) as calls:
             rollout = super().collect_rollouts(env, *args, **kwargs)
@@ -74,7 +74,7 @@ class WatchedEnvironmentMixin(SettingsMixin):
             )
 
     def _check_normalisation(self) -> None:
-        """Warns of an environment whose observations are not those that a loaded model learned from."""
+        """Warns of an environment that does not normalise observations as in the training of a loaded model."""
         if not self.learned_normalised or self.env is None:
             return
         normalize = self._vec_normalize_env
@@ -93,7 +93,7 @@ class WatchedEnvironmentMixin(SettingsMixin):
 
 
 def every_callback(callback: BaseCallback) -> Iterator[BaseCallback]:
-    """A callback and all that it holds."""
+    """A callback and all callbacks inside it."""
     yield callback
     for name, value in vars(callback).items():
         for child in value if isinstance(value, list) else [value]:

@@ -95,7 +95,7 @@ for _name, _maker in {
     "sap/TorcsLaneKeeping-v0": make_torcs_lane_keeping,
     "sap/TorcsDriving-v0": make_torcs_driving,
 }.items():
-    _maker.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make asks it for render modes
+    _maker.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make reads the render modes from it
     register(_name, f"{__name__}:{_maker.__name__}", max_episode_steps=MAX_EPISODE_STEPS)
 
 __all__ = [

@@ -39,7 +39,7 @@ class Simulator(Protocol):
     control_step: float
     """s, between two actions."""
     start: dict[str, float]
-    """Where the car starts unless told otherwise: the arguments of `reset`."""
+    """Default start of the car: the arguments of `reset`."""
 
     def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
         """Put the car on the road, as `CarState` says it, and return where it stands."""

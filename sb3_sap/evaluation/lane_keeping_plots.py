@@ -56,7 +56,7 @@ def predictor_probabilities(model: Any, speed: float) -> Figure:
     """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    # On the axis itself Eq. (6) forbids almost everything, so the angle is swept beside it.
+    # On the axis itself Eq. (6) labels almost every action non-permissible, so the angle is swept beside it.
     beside = 0.3
     sweeps = (
         (1, 1.0, 0.0, "trackPos (+1 left edge), car aligned with the road"),

@@ -1,4 +1,4 @@
-"""Driving laps with a policy alone: what was learned, without noise and without guidance (Table 2)."""
+"""Laps with the policy alone, without noise and without guidance (Table 2)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ENVIRONMENTS = {"highway": "sap/LaneKeeping-v0", "torcs": "sap/TorcsLaneKeeping-
 
 @dataclass(frozen=True)
 class LapResult:
-    """One lap, or what was driven of it."""
+    """One lap, or the part of it that was driven."""
 
     track: str
     lap_done: bool
@@ -57,8 +57,8 @@ def lap(
 ) -> LapResult:
     """Drives one lap in an environment of :func:`lap_env`.
 
-    Several tracks are driven one after the other on purpose. Asking the policy for all of them at once would save a
-    tenth of the time, most of which is physics, and would change the last bit of its actions.
+    Several tracks are driven one after the other on purpose: a batched policy would save a tenth of the time, most of
+    which is physics, and would change the last bit of its actions.
 
     :param on_step: called with the info of each step
     """

@@ -1,6 +1,6 @@
-"""Statistics of SB3's ``VecNormalize`` beside a model file, for a policy that is driven without its environment.
+"""Statistics of SB3's ``VecNormalize`` beside a model file, for a policy that runs without its environment.
 
-A model file does not hold them, and a policy that learned on normalised observations means nothing on raw ones.
+A model file does not hold them, and a policy that learned on normalised observations acts at random on raw ones.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ FILE_NAME = "vecnormalize.pkl"
 
 
 class NormalisedPolicy:
-    """Normalises raw observations as they were while the policy learned; the statistics never change.
+    """Normalises raw observations as in the training of the policy; the statistics are constant.
 
     :param policy: takes normalised observations
     :param path: the file of the statistics
     :raise FileNotFoundError: if there is none
-    :raise ValueError: if it holds something else, or statistics of other observations
+    :raise ValueError: if it holds no statistics, or those of other observations
     """
 
     def __init__(self, policy: BasePolicy, path: Path):
@@ -69,7 +69,7 @@ def shapes(space: spaces.Space[Any]) -> Any:
 
 
 def find_statistics(model: Path) -> Path | None:
-    """Looks where SB3's ``CheckpointCallback``, RL Zoo and this package leave the statistics of a model file.
+    """Finds the statistics of a model file where SB3's ``CheckpointCallback``, RL Zoo and this package save them.
 
     :raise ValueError: if several files could be meant
     """
@@ -92,7 +92,7 @@ def with_statistics(
 ) -> BasePolicy | NormalisedPolicy:
     """The policy, with the statistics given or found if it needs any.
 
-    :param learned_normalised: what the model says of itself; ``None``: nothing
+    :param learned_normalised: whether the model learned on normalised observations; ``None``: unknown
     """
     path = given or (None if learned_normalised is False else find_statistics(model))
     if path is None:
@@ -114,5 +114,5 @@ def add_vecnormalize(command: argparse.ArgumentParser) -> None:
         "--vecnormalize",
         type=Path,
         metavar="FILE",
-        help="statistics of SB3's VecNormalize; without it those beside the model, where its run left some",
+        help="statistics of SB3's VecNormalize; default: those beside the model, if there are any",
     )

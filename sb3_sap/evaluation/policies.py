@@ -15,8 +15,8 @@ from sb3_sap.evaluation.normalisation import NormalisedPolicy, with_statistics
 def load_policy(path: str | Path, vecnormalize: str | Path | None = None) -> BasePolicy | NormalisedPolicy:
     """Loads the policy alone from a model file, whichever SB3 algorithm saved it; it takes raw observations.
 
-    :param vecnormalize: statistics of SB3's ``VecNormalize``; without them those that lie beside the model, as RL Zoo
-        and SB3's ``CheckpointCallback`` leave them, if it learned on normalised observations or does not say
+    :param vecnormalize: statistics of SB3's ``VecNormalize``; ``None``: those beside the model, where RL Zoo and SB3's
+        ``CheckpointCallback`` save them, unless the model is known to have learned on raw observations
     """
     path, vecnormalize = Path(path), None if vecnormalize is None else Path(vecnormalize)
     if not path.is_file():

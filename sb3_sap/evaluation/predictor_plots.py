@@ -15,7 +15,7 @@ from sb3_sap.predictor.network import candidate_logits
 
 #: Points along each axis of a picture.
 RESOLUTION = 121
-#: Bounds of an observation beyond which they say nothing of what occurs.
+#: Bounds beyond this do not describe the range that occurs.
 UNBOUNDED = 1e6
 
 
@@ -50,14 +50,15 @@ def plot_permissibility(
 ) -> Figure:
     """Draws the predicted permissible region over one state variable and one action, with the actor's choice on it.
 
-    Everything is in the environment's units. The other state variables are held; the other actions are the actor's.
+    All values are in the environment's units. The other state variables are held, and the other actions are the
+    actor's.
 
     :param model: a guided model whose predictor was fitted
     :param variable: index of the state variable in the flattened observation; of a ``Dict``: (key, index)
-    :param action: index of the action in the flattened action; a finite action space has one
-    :param obs: the observation whose other variables are held; ``None``: one amid those of the training,
-        or zeros, which the picture then says, where none is known
-    :param limits: of the variable; ``None``: what K holds without its outermost hundredths, or the space's bounds
+    :param action: index of the action in the flattened action; a ``Discrete`` space has one
+    :param obs: the observation whose other variables are held; ``None``: a typical one of the training, or
+        zeros where none is known, which the title then says
+    :param limits: of the variable; ``None``: the 1st to the 99th percentile in K, or the bounds of the space
     :param variable_name: for the axis
     :param action_name: for the axis
     :param axis: where to draw; ``None``: a figure of its own
@@ -99,7 +100,7 @@ def plot_permissibility(
     axis.set(xlabel=variable_name or f"{key or 'observation'}[{index}]")
     axis.set(ylabel=action_name or ("action" if n_actions == 1 else f"action[{action}]"))
     if invented:
-        axis.set_title("the other variables are held at 0, in a state that may not occur", fontsize="small")
+        axis.set_title("the other variables are held at 0: such a state may not occur", fontsize="small")
     figure = axis.get_figure(root=True)
     assert figure is not None
     figure.colorbar(image, ax=axis, label="E: probability of permissible")
@@ -107,16 +108,16 @@ def plot_permissibility(
 
 
 def draw_permissibility(axis: Axes, model: Any, values: FloatArray, obs: Observations, action: int = 0) -> Any:
-    """Draws E's verdict over one action in each of n states, and the actor's choice, into a matplotlib axis.
+    """Draws E's probability over one action in each of n states, and the actor's choice, into a matplotlib axis.
 
-    :param values: (n,) where along the horizontal axis each state stands
+    :param values: (n,) position of each state along the horizontal axis
     :param obs: (n, *obs_shape) raw
     :return: the image, for a colour bar
     """
     space = model.action_space
     chosen = model.predict(_as_the_policy_sees(model, obs), deterministic=True)[0]
     if isinstance(space, spaces.Discrete):
-        heights: Any = np.arange(space.n)  # SB3 knows finite spaces that start at zero alone
+        heights: Any = np.arange(space.n)  # discrete actions count from 0 in SB3
         probability = permissible_probability(model, obs, heights)
         picked, style = chosen.reshape(-1), "k."
         axis.set_yticks(heights)

@@ -1,4 +1,4 @@
-"""The permissible actor loss: what E knows, taught to the actor itself. It goes beyond the paper."""
+"""Auxiliary actor loss towards actions predicted permissible (not in the paper)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def permissible_actor_step(
     This is the cross-entropy of the actor's own action under the predictor, had it been labelled permissible. An
     optimal action is permissible by Definition 3, so under a perfect E the term vanishes at the optimum.
 
-    :param actor: with its ``optimizer``; of a stochastic one the mean action counts, so that its entropy is left alone
+    :param actor: with its ``optimizer``; the mean action of a stochastic one is used, so that its entropy is unaffected
     :param coef: β
     :param batch_size: states drawn from the replay buffer
     :param env: normalises the states, if given
@@ -57,15 +57,15 @@ def permissible_value_step(
     batch_size: int,
     env: VecNormalize | None = None,
 ) -> float:
-    """The same for finite actions, where the largest value acts: one gradient step on β · softplus(Q(s, a) − Q(s, b)).
+    """Discrete actions: the greedy action takes the actor's place; one step on β · softplus(Q(s, a) − Q(s, b)).
 
-    a is each action that E rejects, b the best that it permits: the cross-entropy of preferring b. What guidance
-    keeps from being executed is never corrected by experience: where rewards are negative, an unknown action looks
-    better than all that is known. By Definition 3 no optimal policy takes it, so its value is free. Both values move,
-    because lowering one alone lowers all that share its features, without end.
+    a is each action that E rejects, b the best one that it permits: this is the cross-entropy of preferring b. The
+    values of actions that guidance prevents are never corrected by experience: with negative rewards, an unknown
+    action looks better than every known one. By Definition 3 no optimal policy takes it, so its value is free. Both
+    values move, because lowering one alone would lower all values that share its features, without end.
 
     :param model: DQN or QR-DQN
-    :return: the loss before the step; 0 where E does not tell the actions of any state apart
+    :return: the loss before the step; 0 if E separates the actions of no state
     """
     observations = replay_buffer.sample(batch_size, env=env).observations
     model.policy.set_training_mode(False)
@@ -76,10 +76,10 @@ def permissible_value_step(
         features = predictor.features(observations).repeat_interleave(k, dim=0)
         rejected = (predictor.logits(features, every.flatten()) <= 0).reshape(n, k)
     best = values.masked_fill(rejected, -th.inf).max(dim=1, keepdim=True).values
-    told = rejected & best.isfinite()
-    if not told.any():
+    separated = rejected & best.isfinite()
+    if not separated.any():
         return 0.0
-    loss = coef * F.softplus(values - best)[told].mean()
+    loss = coef * F.softplus(values - best)[separated].mean()
     model.policy.optimizer.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     model.policy.optimizer.step()

@@ -1,4 +1,4 @@
-"""A_st, the actions to choose from instead of a rejected one, and how one of them is chosen (Alg. 1, lines 8 to 11)."""
+"""A_st, the candidates that may replace a rejected action, and the choice among them (Alg. 1, lines 8 to 11)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ SELECTIONS = ("random", "nearest", "highest_q", "most_permissible")
 def candidate_actions(
     rng: np.random.Generator, space: spaces.Space[Any], low: FloatArray, high: FloatArray, n: int
 ) -> np.ndarray[Any, Any]:
-    """A_st for m states: n stratified draws from a continuous space, or every action of a finite one.
+    """A_st for m states: n stratified draws from a continuous space, or every discrete action.
 
-    :param low: (m, action_dim) lower bounds, scaled; a finite space has no use for them
+    :param low: (m, action_dim) lower bounds, scaled; ignored for discrete actions
     :param high: (m, action_dim) upper bounds
     :return: (m, n, action_dim)
     """
@@ -30,7 +30,7 @@ def candidate_actions(
 def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: FloatArray, n: int) -> FloatArray:
     """Low-variance uniform sampling (section 4.3): one draw from each of n equal strata of every dimension.
 
-    In one dimension the candidates come in ascending order; in more, the strata of the dimensions are paired at
+    In one dimension the candidates are in ascending order; in more, the strata of the dimensions are paired at
     random, which is Latin hypercube sampling.
 
     :param low: (m, action_dim) lower bounds

@@ -61,7 +61,7 @@ class ConstrainedExplorationMixin(SettingsMixin):
                 f"{self.action_space}: say what is allowed with `permissible_actions`."
             )
         super()._setup_model()
-        # Without a seed SB3 leaves its generators alone; `load` has restored ours already.
+        # Without a seed SB3 does not seed anything; `load` has already restored the saved generator.
         self.exploration_rng = saved_rng or self.exploration_rng or make_rng(None, "exploration")
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -108,12 +108,13 @@ class ConstrainedExplorationMixin(SettingsMixin):
         return action, scaled
 
     def sample_candidates(self, rows: np.ndarray[Any, Any], n_envs: int) -> tuple[np.ndarray[Any, Any], BoolArray]:
-        """A_st of m of the environments, (m, N, action_dim) scaled, and which of them the rules allow, (m, N)."""
+        """A_st for m of the environments, (m, N, action_dim) scaled, and which candidates are allowed, (m, N)."""
         low, high = (bound.reshape(n_envs, -1)[rows] for bound in self._allowed_interval(n_envs))
         candidates = candidate_actions(self.exploration_rng, self.action_space, low, high, self.n_candidates)
         return candidates, self.allowed_candidates(rows_of(self.raw_last_obs(), rows), candidates)
 
     def allowed_candidates(self, raw_obs: Any, candidates: np.ndarray[Any, Any]) -> BoolArray:
+        """Which of (m, N, action_dim) candidates ``permissible_actions`` allows in m states, (m, N)."""
         m, n, _ = candidates.shape
         if self._permissible_actions is None:
             return np.ones((m, n), dtype=bool)
@@ -125,7 +126,7 @@ class ConstrainedExplorationMixin(SettingsMixin):
         return query_labels(self._permissible_actions, "permissible_actions", raw_obs, self.unscale_actions(scaled))
 
     def unscale_actions(self, scaled: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Scaled actions in the environment's units; those of a finite space are their own."""
+        """Scaled actions in the environment's units; discrete actions are returned unchanged."""
         return scaled if isinstance(self.action_space, spaces.Discrete) else self.policy.unscale_action(scaled)
 
     def _allowed_interval(self, n_envs: int) -> tuple[FloatArray, FloatArray]:
@@ -138,7 +139,7 @@ class ConstrainedExplorationMixin(SettingsMixin):
                     interval = query_constraint(
                         self._constraint, low[i].shape, rows_of(self.raw_last_obs(), i), *previous
                     )
-                    # An interval may reach beyond the action space; what counts is the part inside.
+                    # An interval may extend beyond the action space; only the part inside counts.
                     low[i], high[i] = (np.clip(self.policy.scale_action(bound), -1, 1) for bound in interval)
                     if not (low[i] <= high[i]).all():
                         raise ValueError(f"`constraint` must return (low, high) with low <= high, but gave {interval}.")

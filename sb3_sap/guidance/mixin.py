@@ -26,8 +26,8 @@ class ActionPermissibilityMixin(AuxiliaryLossMixin):
           SavingMixin                     what files hold
             DDPG, TD3, SAC, TQC, ...      the base algorithm
 
-    ``predict`` remains the policy alone unless it is told otherwise, so that every evaluation tool of SB3 measures
-    what was learned; both buffers hold the action that was executed.
+    ``predict`` is the policy alone unless ``guided=True`` is passed, so that every evaluation tool of SB3 measures
+    what was learned; both buffers store the executed action.
 
     The parameters are those of :class:`~sb3_sap.guidance.algorithm1.GuidedExplorationMixin`,
     :class:`~sb3_sap.guidance.auxiliary_update.AuxiliaryLossMixin`,

@@ -1,4 +1,4 @@
-"""The replay buffers R that feed the knowledge buffer K as well."""
+"""Replay buffers R that also fill the knowledge buffer K."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from sb3_sap.predictor.knowledge import KnowledgeBuffer
 
 
 class KnowledgeMixin(ReplayBuffer):
-    """Makes any SB3 replay buffer R feed K as well; K is saved and loaded with it.
+    """Makes any SB3 replay buffer R fill K as well; K is saved and loaded with it.
 
-    :param knowledge: K, filled with every transition added
+    :param knowledge: K, to which every labelled transition is added
     :param ap_function: labels the transitions; without it the label is taken from ``info["permissible"]``
     """
 
-    #: The images that the AP function sees channels last (:func:`~sb3_sap.common.vec_envs.channels_last`).
+    #: The images that the AP function gets channels last (:func:`~sb3_sap.common.vec_envs.channels_last`).
     images: tuple[str, ...] = ()
-    #: Whether a transition without a label is an error; else it is left out of K.
+    #: Whether a transition without a label is an error; otherwise it is not added to K.
     needs_labels: bool = True
 
     def __init__(
@@ -47,7 +47,7 @@ class KnowledgeMixin(ReplayBuffer):
         done: np.ndarray[Any, Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        # SB3 hands over raw observations, and the true last one of an episode: here a label is right.
+        # SB3 passes raw observations here, and the true last one of an episode.
         for i, info in enumerate(infos):
             if RAW_LAST in info:
                 _put(next_obs, i, info[RAW_LAST])
@@ -69,12 +69,12 @@ class KnowledgeMixin(ReplayBuffer):
         return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
 
     def __getstate__(self) -> dict[str, Any]:
-        # The AP function is the model's; the file holds data alone.
+        # The AP function belongs to the model; the file holds only data.
         return {**super().__getstate__(), "ap_function": None}  # type: ignore[dict-item]
 
 
 class PermissibilityReplayBuffer(KnowledgeMixin, ReplayBuffer):
-    """SB3's replay buffer R that also feeds K."""
+    """SB3's replay buffer, which also fills K."""
 
 
 class PermissibilityDictReplayBuffer(KnowledgeMixin, DictReplayBuffer):
@@ -89,7 +89,7 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
     """The same with hindsight goals; K keeps the goals that were pursued."""
 
 
-#: What takes the place of each of SB3's buffers in a guided algorithm.
+#: The version of each of SB3's buffers for a guided algorithm.
 GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
     ReplayBuffer: PermissibilityReplayBuffer,
     DictReplayBuffer: PermissibilityDictReplayBuffer,
@@ -110,7 +110,7 @@ def _put(observations: Any, row: int, obs: Any) -> None:
 def guided_buffer_class(
     requested: type[ReplayBuffer] | None, observation_space: spaces.Space[Any], n_steps: int
 ) -> type[KnowledgeMixin]:
-    """The buffer class that SB3 would have chosen, or that the user asked for, in the form that feeds K."""
+    """The requested buffer class, or the one that SB3 would have chosen, in the version that fills K."""
     # A saved model names the class that its own n_steps led to; `load` may be given others.
     if requested is None or requested is PermissibilityReplayBuffer:
         plain = NStepReplayBuffer if n_steps > 1 else ReplayBuffer

@@ -17,7 +17,7 @@ from sb3_sap.predictor.buffers import KnowledgeMixin, guided_buffer_class
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.network import PermissibilityPredictor
 
-#: Unless it is told otherwise, E extracts features from observations as the policy does.
+#: By default E extracts features from observations as the policy does.
 SHARED = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
 #: Arguments of the predictor that its saved weights and optimizer depend on.
 ARCHITECTURE = (
@@ -56,7 +56,7 @@ def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[Permissibility
             f"fit no other: build a new {type(model).__name__} with them, and give it the loaded policy with "
             "`new.policy.load_state_dict(loaded.policy.state_dict())`."
         )
-    # A network of our own must not shift the global generator, or runs would no longer compare to the base's.
+    # Building E must not shift the global generator, or a run without guidance would differ from the base's.
     with th.random.fork_rng(devices=[]):
         th.default_generator.manual_seed(int(make_rng(model.seed, "predictor").integers(2**31)))
         predictor = PermissibilityPredictor(model.observation_space, model.action_space, **arguments)
@@ -86,7 +86,7 @@ def make_knowledge(model: Any) -> KnowledgeBuffer:
 
 
 def make_replay_buffer(model: Any) -> KnowledgeMixin:
-    """An empty R that feeds an empty K, of the class that SB3 would have chosen or that the user asked for."""
+    """An empty R that feeds an empty K, of the requested class or the one that SB3 would have chosen."""
     buffer_class = guided_buffer_class(model.replay_buffer_class, model.observation_space, model.n_steps)
     kwargs: dict[str, Any] = dict(model.replay_buffer_kwargs)
     if issubclass(buffer_class, NStepReplayBuffer):
@@ -113,7 +113,7 @@ def make_replay_buffer(model: Any) -> KnowledgeMixin:
 
 
 def described(value: Any) -> Any:
-    """An argument of a network in words and numbers, which stay the same when a model is saved and loaded."""
+    """An argument of a network as words and numbers, which do not change when a model is saved and loaded."""
     if isinstance(value, Mapping):
         return {str(key): described(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

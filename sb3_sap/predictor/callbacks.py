@@ -11,15 +11,15 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from sb3_sap.predictor.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
 from sb3_sap.predictor.tensorboard import add_layout
 
-#: Labels of one class alone, after which the user is told that the AP function separates nothing.
+#: Number of labels, all of one class, after which the user is warned.
 CONSTANT_LABELS_WARNING = 1_000
 
 
 class PermissibilityCallback(BaseCallback):
-    """Fits E at the end of each rollout, once for every vectorised step unless ``refit_growth`` skips it; validates it.
+    """Fits and validates E at the end of each rollout, as often as the model's settings say.
 
-    A guided model installs one by itself. To change how E is trained, override :meth:`fit` or :meth:`validate` and
-    pass an instance to ``learn(callback=...)``: it takes the place of the default.
+    A guided model adds one automatically. To change how E is trained, override :meth:`fit` or :meth:`validate` and
+    pass an instance to ``learn(callback=...)``: it replaces the default one.
     """
 
     model: Any  # a guided model: what it needs is in LearnedPermissibilityMixin
@@ -68,7 +68,7 @@ class PermissibilityCallback(BaseCallback):
         self.logger.record_mean("sap/predictor_loss", loss)
 
     def validate(self) -> None:
-        """Measures E on ``validation_size`` examples it was never trained on; the α gate follows the result."""
+        """Measures E on ``validation_size`` held-out examples; the gate of α depends on the result."""
         model = self.model
         sample = self.knowledge.sample(model.validation_size, "validation", model.get_vec_normalize_env())
         non_permissible, permissible = model.predictor.recall(sample)
@@ -88,7 +88,7 @@ class PermissibilityCallback(BaseCallback):
 
 
 def contains_permissibility_callback(callback: object) -> bool:
-    """Whether the user's callbacks, lists within lists, bring a :class:`PermissibilityCallback` of their own."""
+    """Whether the user's callbacks, nested lists included, contain a :class:`PermissibilityCallback`."""
     if isinstance(callback, PermissibilityCallback):
         return True
     if isinstance(callback, list):
@@ -101,10 +101,10 @@ def contains_permissibility_callback(callback: object) -> bool:
 
 
 def _refuse_inside(event: EventCallback) -> None:
-    # SB3's event callbacks pass the end of a rollout on to none of their children: E would never be trained.
+    # SB3's event callbacks do not pass the end of a rollout on to their children: E would never be trained.
     children = [event.callback, getattr(event, "callback_on_new_best", None)]
     if contains_permissibility_callback(children):
         raise ValueError(
             f"A PermissibilityCallback inside {type(event).__name__} would never train the AP predictor, because it is "
-            "not told there when a rollout ends: pass it to `learn(callback=[...])` itself."
+            "not called there when a rollout ends: pass it to `learn(callback=[...])` itself."
         )

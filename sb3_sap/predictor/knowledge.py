@@ -19,7 +19,7 @@ from sb3_sap.predictor.slots import ClassSlots
 
 NON_PERMISSIBLE, PERMISSIBLE = 0, 1
 CLASSES = (NON_PERMISSIBLE, PERMISSIBLE)
-#: Observations, at most, among which a typical one is looked for.
+#: Maximum number of observations among which a typical one is sought.
 TYPICAL = 1_000
 Part = Literal["train", "validation"]
 
@@ -42,7 +42,7 @@ class KnowledgeBuffer:
     :param size: capacity; the paper's is 10,000
     :param validation_fraction: share kept for validation; the paper's 9:1 is 0.1
     :param seed: of the generator that splits and samples
-    :param min_per_class: in each part, tuples of a class that the other class makes room for
+    :param min_per_class: tuples of a class, in each part, up to which it may replace tuples of the other class
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class KnowledgeBuffer:
     def sample(
         self, n: int, part: Part = "train", env: VecNormalize | None = None, balanced: bool = True
     ) -> LabelledActions:
-        """Draws D_E, balanced and stratified: n // 2 tuples of each class, with replacement, in random order.
+        """Draws a balanced D_E: n // 2 tuples of each class, with replacement, in random order.
 
         :param env: normalises the observations, if given
         :param balanced: False draws every tuple with the same probability

@@ -28,7 +28,7 @@ SUFFICIENT_ACCURACY = 0.7
 class PermissibilityPredictor(BaseModel):
     """E(s, a | θ_E): the logit that action a is permissible in state s.
 
-    It sees observations as the policy sees them, and actions scaled to [-1, 1] or, of a finite space, one-hot.
+    Its inputs are observations as the policy gets them, and actions scaled to [-1, 1], or one-hot if they are discrete.
 
     :param observation_space: of the environment
     :param action_space: of the environment
@@ -142,7 +142,7 @@ class PermissibilityPredictor(BaseModel):
 
     @flush_denormals()
     def fit(self, dataset: LabelledActions) -> float:
-        """One pass of mini-batch gradient descent over D_E, whose rows come in random order.
+        """One pass of mini-batch gradient descent over D_E, whose rows are in random order.
 
         :return: mean loss over the mini-batches
         """
@@ -161,7 +161,7 @@ class PermissibilityPredictor(BaseModel):
 
     @contextmanager
     def _training(self) -> Iterator[None]:
-        """Training mode for a while, whose random layers leave the global generators alone."""
+        """Training mode within the block; random layers do not touch the global generators."""
         cuda = self.device.type == "cuda"
         seed = (self._seed + int(self.n_updates)) % 2**63
         with th.random.fork_rng(devices=[self.device] if cuda else []):

@@ -8,13 +8,13 @@ import numpy as np
 
 
 class ClassSlots:
-    """Which slots of a full or filling store belong to which class, oldest first.
+    """Assigns the slots of a store to two classes.
 
-    When the store is full, a new tuple replaces the oldest of its class; of a class that has too few, the oldest of
-    the other, which is then the larger one.
+    When the store is full, a new tuple replaces the oldest of its class; if its class has too few, it replaces the
+    oldest of the other class, which is then the larger one.
 
     :param capacity: number of slots
-    :param least: tuples of a class below which it grows, at most half of the capacity
+    :param least: number of tuples below which a class still grows, at most half of the capacity
     """
 
     def __init__(self, capacity: int, least: int = 1):
@@ -42,7 +42,7 @@ class ClassSlots:
         return int(self._slots[label, position])
 
     def _append(self, label: int, slot: int) -> int:
-        # Only classes that have never wrapped, or have just been put in order, grow: the newest is also the last.
+        # Only classes that never wrapped, or were just sorted by age, grow: the newest tuple is also the last.
         self._slots[label, self.counts[label]] = slot
         self.counts[label] += 1
         return slot

@@ -1,10 +1,10 @@
-"""A layout for TensorBoard: what belongs to the method on one page, under "Custom Scalars"."""
+"""A layout for TensorBoard's tab "Custom Scalars": the metrics of the method on one page."""
 
 from __future__ import annotations
 
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-#: Category → chart → the kind of chart and what is drawn in it.
+#: Category → chart → kind of chart and its metrics.
 LAYOUT = {
     "action permissibility": {
         "AP predictor: validation accuracy": [
@@ -29,7 +29,7 @@ LAYOUT = {
 
 
 def add_layout(logger: Logger) -> None:
-    """Writes the layout where a logger writes to TensorBoard; else nothing."""
+    """Writes the layout if a logger writes to TensorBoard."""
     for output in logger.output_formats:
         if isinstance(output, TensorBoardOutputFormat):
             output.writer.add_custom_scalars(LAYOUT)

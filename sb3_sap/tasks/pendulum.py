@@ -46,7 +46,7 @@ def pendulum_energy(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     """False where the energy was off that of standing upright and the torque took it further off. Parameters as above.
 
     *Heuristic*, with the idea of the mountain cars: below that energy the motor must not brake, above it must not
-    drive. The reward also asks for little torque and speed, and near the top for a catch that energy does not tell.
+    drive. The reward also prefers little torque and speed, and near the top a catch that energy does not show.
     """
     missing = -energy(next_obs)
     work = actions[:, 0] * np.sign(missing)  # positive: wanted in the direction of motion

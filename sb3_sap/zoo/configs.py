@@ -1,4 +1,4 @@
-"""Where an algorithm's YAML lies, and what is wrong with one: told in a sentence before anything is built from it."""
+"""The YAML file of an algorithm, and errors in it, reported in a sentence before anything is built from it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_sap.common.functions import resolve
 from sb3_sap.common.schedules import LINEAR
 from sb3_sap.presets import RUNNER_KEYS, algorithms
 
-#: What the words of an annotation admit. An annotation with any other word is left to the constructor.
+#: Types that the words of an annotation allow. Annotations with other words are checked by the constructor.
 KINDS: dict[str, tuple[type, ...]] = {
     "int": (int,),
     "float": (int, float),
@@ -67,7 +67,7 @@ def check_file(path: str) -> None:
 
 
 def evaluation_options(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of the environment in evaluations: the entry's, but on the laps that the environment has by itself."""
+    """Options of the environment in evaluations: those of the entry, but for ``laps``, whose default is used."""
     return {name: value for name, value in hyperparams.get("env_kwargs", {}).items() if name != "laps"}
 
 

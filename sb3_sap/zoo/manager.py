@@ -1,4 +1,4 @@
-"""rl_zoo3's ExperimentManager without its faults: each method here mends one, seen in rl_zoo3 2.9.2."""
+"""rl_zoo3's ExperimentManager with corrections: each method here corrects one fault of rl_zoo3 2.9.2."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sb3_sap.zoo.storages import SeededByTrial, check_belongs, load_study
 
 
 class CallbacksEndingOnce(CallbackList):
-    """Callbacks that are told once that the training ended, and not at all if it never began."""
+    """Calls ``on_training_end`` once, and not at all if the training never began."""
 
     def __init__(self, callbacks: list[BaseCallback]):
         super().__init__(callbacks)

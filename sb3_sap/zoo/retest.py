@@ -1,4 +1,4 @@
-"""Winners of a study on fresh seeds, beside the configuration's own settings: was it more than luck?"""
+"""The best trials of a study on fresh seeds, beside the default settings: was it more than luck?"""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class RetestManager(StudyManager):
         print(f"{text}\nThe comparison is in {folder}")
 
     def _follow(self, study: optuna.Study) -> None:
-        """Evaluates as the study did, unless told otherwise."""
-        told = study.user_attrs.get("n_timesteps", self.n_timesteps)
-        if told != self.n_timesteps:
-            print(f"Note: the study trained {told} steps, this trains {self.n_timesteps}.")
+        """Evaluates as the study did, unless flags say otherwise."""
+        steps = study.user_attrs.get("n_timesteps", self.n_timesteps)
+        if steps != self.n_timesteps:
+            print(f"Note: the study trained {steps} steps, this trains {self.n_timesteps}.")
         tracks = self.options.tracks or self.options.validation_tracks or study.user_attrs.get("validation_tracks", [])
         self.options.validation_tracks = tracks
         if tracks:

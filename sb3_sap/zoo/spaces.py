@@ -15,9 +15,9 @@ Converter = Callable[[Params], Params]
 
 #: t_k is sought between these shares of a run, evenly in its logarithm. The paper's are 1/20 and 1/30.
 T_K_SHARES = (1 / 60, 1 / 3)
-#: Length of a run that nobody told: the paper's short one.
+#: Length of a run where none is given: the paper's short one.
 DEFAULT_STEPS = 3_000
-#: Sampled as exponents of 2, because of values that differ by a few nothing can be learned.
+#: Sampled as exponents of 2, because values that differ by a few make no difference.
 POWERS = ("n_candidates", "dataset_size")
 PREDICTOR_PREFIX = "predictor_"
 
@@ -35,7 +35,7 @@ def sample_guidance(trial: optuna.Trial, n_timesteps: int) -> Params:
 
 
 def sample_predictor(trial: optuna.Trial) -> Params:
-    """What makes E good, and what is made of it."""
+    """Settings of E and of its use."""
     return {
         "actor_permissibility_coef": trial.suggest_float("actor_permissibility_coef", 0.0, 3.0),
         "alpha_low": trial.suggest_float("alpha_low", 0.0, 1.0),

@@ -64,7 +64,7 @@ def _open_database(url: str, heartbeat: int | None, attempts: int = 10) -> BaseS
 
 
 def without_password(text: str) -> str:
-    """Database URLs within a text, fit to be shown."""
+    """A text in which the passwords of database URLs are masked."""
     return re.sub(r"(://[^:/@\s]+):[^@\s]+@", r"\1:***@", text)
 
 
@@ -81,11 +81,11 @@ def load_study(storage: str, study_name: str) -> optuna.Study:
 
 def check_belongs(study: optuna.Study, algo: str, env_id: str) -> None:
     """Refuses a study of something else."""
-    told = study.user_attrs.get("algo", algo), study.user_attrs.get("env", env_id)
-    if told != (algo, env_id):
+    found = study.user_attrs.get("algo", algo), study.user_attrs.get("env", env_id)
+    if found != (algo, env_id):
         raise ValueError(
-            f"The study {study.study_name!r} is one of {told[0]} on {told[1]}, not of {algo} on {env_id}: give another "
-            "`--study-name`."
+            f"The study {study.study_name!r} is one of {found[0]} on {found[1]}, not of {algo} on {env_id}: give "
+            "another `--study-name`."
         )
 
 

@@ -1,4 +1,4 @@
-"""What a trial tells Optuna while it runs."""
+"""What a trial reports to Optuna while it runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 
 
 class ReportingCallback(TrialEvalCallback):
-    """Reports evaluations by training step, asks the pruner only once E guides, and never ends without a verdict."""
+    """Reports evaluations by training step, prunes only once E guides, and always ends with an evaluation."""
 
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq != 0:

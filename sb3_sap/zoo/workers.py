@@ -32,7 +32,7 @@ class SurplusTrial(Exception):
 
 def work_until(study: optuna.Study, objective: Callable[[optuna.Trial], float], max_total_trials: int) -> None:
     """Runs trials until that many are finished, by whichever worker; those of workers that died are run again."""
-    told = False
+    reported = False
     while True:
         reap(study)
         trials = study.get_trials(deepcopy=False, states=LIVE)
@@ -42,15 +42,15 @@ def work_until(study: optuna.Study, objective: Callable[[optuna.Trial], float], 
         if waiting or len(trials) < max_total_trials:
             study.optimize(objective, n_trials=1, catch=(SurplusTrial,), gc_after_trial=True)
             continue
-        if not told:
-            told = True
+        if not reported:
+            reported = True
             running = [trial.number for trial in trials if trial.state == TrialState.RUNNING]
             print(f"Waiting for trials {running} of other workers, in case one of them dies.")
         time.sleep(POLL)
 
 
 def count_workers(n_jobs: int, n_trials: int) -> int:
-    """How many workers ``--n-jobs`` asks for: never more than trials, and for -1 one of each processor."""
+    """How many workers ``--n-jobs`` asks for: never more than trials, and for -1 one per processor."""
     if n_jobs < 1 and n_jobs != -1:
         raise ValueError(f"`--n-jobs` must be at least 1, or -1 for a worker of each processor, but is {n_jobs}.")
     return max(1, min(n_trials, n_jobs if n_jobs > 0 else os.cpu_count() or 1))

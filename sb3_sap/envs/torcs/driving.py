@@ -1,4 +1,4 @@
-"""``sap/TorcsDriving-v0``: steering and pedal at racing speed, several dimensions, which the paper leaves open."""
+"""``sap/TorcsDriving-v0``: steering and pedal at racing speed. The paper leaves several action dimensions open."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def too_fast(obs: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def dawdles(obs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where a well placed car is slower than anything in sight asks for; (n,) of (n, obs_dim)."""
+    """Where a well placed car is slower than anything in sight requires; (n,) of (n, obs_dim)."""
     sharpest = np.abs(obs[:, 5 : 5 + len(LOOK_AHEAD)]).max(axis=1) * CURVATURE_SCALE  # (n,), 1/m
     speed_squared = (obs[:, 2] * OBSERVATION_SCALE[2] / KMH) ** 2
     well_placed = (np.abs(obs[:, 0]) < SURE_ANGLE) & (np.abs(obs[:, 1]) < SURE_TRACK_POS)

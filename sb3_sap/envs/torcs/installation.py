@@ -1,4 +1,4 @@
-"""Finding an installed TORCS, and saying what is missing before the libraries, which would only crash, are asked."""
+"""Finding an installed TORCS, and reporting what is missing before its libraries, which would crash, are loaded."""
 
 from __future__ import annotations
 

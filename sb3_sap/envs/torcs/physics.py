@@ -28,7 +28,7 @@ MAX_DAMAGE = 10_000
 SKILL_LEVELS = range(4)
 """0 rookie to 3 pro; the level changes the grip of the tyres."""
 MAX_GEAR = 8
-"""What TORCS has room for; a car ignores gears that it lacks."""
+"""TORCS' limit; a car ignores gears that it lacks."""
 MAX_FACTOR = 100.0
 """Of fuel and damage."""
 TRIAL_PLACES, TRIAL_TICKS = 40, 100
@@ -174,8 +174,8 @@ class Physics(CarReadings):
             self._pool.release(library)
 
     def __del__(self, finalizing: Callable[[], bool] = sys.is_finalizing) -> None:
-        # Environments are often dropped without being closed; the libraries go back all the same. As Python ends it
-        # empties its modules, this one too, and there is nobody left to give them back to.
+        # Environments are often dropped without being closed; the libraries are returned all the same. At the end of
+        # Python its modules are empty, and there is no pool to return them to.
         if getattr(self, "_library", None) is not None and not finalizing():
             self.close()
 

@@ -10,7 +10,7 @@ from sb3_sap.envs.torcs.libraries import Shared
 from sb3_sap.envs.torcs.road import Road
 
 MAX_TRACK_POS, MAX_HEIGHT = 1.0, 10.0
-"""A car is placed on the road, and at most so many metres above it."""
+"""Limits of a placed car: half widths from the axis, and m above the road."""
 
 
 def check_place(distance: float, track_pos: float, angle: float, height: float) -> None:

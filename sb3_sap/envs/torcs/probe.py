@@ -37,7 +37,7 @@ def survives(trial: Callable[[], object], limit: int = TIME_LIMIT) -> str | None
 def _run(trial: Callable[[], object], limit: int) -> None:
     status = 1
     try:
-        faulthandler.disable()  # a crash is expected, and told by the parent
+        faulthandler.disable()  # a crash is expected, and reported by the parent
         silence = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silence, 1)
         os.dup2(silence, 2)

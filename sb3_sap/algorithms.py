@@ -12,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.constraints import ActionConstraint
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
 
 #: The lane-keeping constraints of section 5.1, by name, because the algorithms import no environment.
 CE1 = "sb3_sap.envs.constraint_ce1"
@@ -104,3 +105,16 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
     "dqn_ap": DQNAP,
     "qrdqn_ap": QRDQNAP,
 }
+
+
+def is_guided(algo: str) -> bool:
+    """Whether the algorithm of that RL Zoo name learns permissibility."""
+    return algo in ALGORITHMS and issubclass(ALGORITHMS[algo], LearnedPermissibilityMixin)
+
+
+def base_of(algo: str) -> str:
+    """The RL Zoo name of an algorithm's base, such as ``"ddpg"`` for ``"ddpg_ap_ce2"``; of others, the name itself."""
+    if algo not in ALGORITHMS:
+        return algo
+    bases = (cls for cls in ALGORITHMS[algo].__mro__ if not cls.__module__.startswith("sb3_sap."))
+    return next(bases).__name__.lower()

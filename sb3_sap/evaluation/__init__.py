@@ -1,6 +1,7 @@
 """What was learned, measured and drawn: laps, policies from files, plots, statistics."""
 
 from sb3_sap.evaluation.environments import make_env
+from sb3_sap.evaluation.laps import drive_lap
 from sb3_sap.evaluation.policies import load_policy
 
-__all__ = ["load_policy", "make_env"]
+__all__ = ["drive_lap", "load_policy", "make_env"]

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sap.common.extractors import with_extractor
 from sb3_sap.common.random import make_rng
+from sb3_sap.common.torch_utils import own_generators
 from sb3_sap.predictor.buffers import KnowledgeMixin, guided_buffer_class
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.network import PermissibilityPredictor
@@ -57,10 +57,12 @@ def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[Permissibility
             "`new.policy.load_state_dict(loaded.policy.state_dict())`."
         )
     # Building E must not shift the global generator, or a run without guidance would differ from the base's.
-    with th.random.fork_rng(devices=[]):
-        th.default_generator.manual_seed(int(make_rng(model.seed, "predictor").integers(2**31)))
+    with own_generators(int(make_rng(model.seed, "predictor").integers(2**31)), model.device):
         predictor = PermissibilityPredictor(model.observation_space, model.action_space, **arguments)
-    return predictor.to(model.device), architecture
+    predictor = predictor.to(model.device)
+    # Some optimizers, such as Adagrad, have a state from the start, which loading moves to the device of the weights.
+    predictor.optimizer.load_state_dict(predictor.optimizer.state_dict())
+    return predictor, architecture
 
 
 def make_knowledge(model: Any) -> KnowledgeBuffer:

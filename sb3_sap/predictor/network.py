@@ -18,7 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_sap.common.arrays import FloatArray
-from sb3_sap.common.torch_utils import flush_denormals
+from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.predictor.knowledge import LabelledActions
 
 #: Balanced validation accuracy from which E is accurate enough for α; below it, ``alpha_low`` holds (section 4.3).
@@ -162,12 +162,7 @@ class PermissibilityPredictor(BaseModel):
     @contextmanager
     def _training(self) -> Iterator[None]:
         """Training mode within the block; random layers do not touch the global generators."""
-        cuda = self.device.type == "cuda"
-        seed = (self._seed + int(self.n_updates)) % 2**63
-        with th.random.fork_rng(devices=[self.device] if cuda else []):
-            th.default_generator.manual_seed(seed)
-            if cuda:
-                th.cuda.manual_seed(seed)
+        with own_generators((self._seed + int(self.n_updates)) % 2**63, self.device):
             self.set_training_mode(True)
             try:
                 yield

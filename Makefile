@@ -13,7 +13,7 @@ LOWEST := .venv-lowest/bin
 # The release of torch beside the lowest versions of everything else. Of the lowest one, too: LOWEST_TORCH=torch==2.8.0
 LOWEST_TORCH ?= -c constraints.txt torch
 
-.PHONY: demo test test-all lowest torcs lint docs coverage clean
+.PHONY: demo test test-all lowest torcs lint docs coverage release clean
 
 demo: .venv/.installed
 	$(BIN)/sb3-sap demo
@@ -48,6 +48,10 @@ docs: .venv/.installed
 
 coverage: .venv/.installed
 	$(BIN)/pytest -q -n 2 --cov --cov-report=term-missing:skip-covered
+
+# The version, the archives in dist/, a commit and a tag; CONTRIBUTING.md has the checklist around it.
+release: .venv/.installed
+	$(BIN)/python .ci/release.py "$(VERSION)"
 
 .venv/.installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -18,6 +18,8 @@ default_role = "code"  # single backticks in docstrings are code, as in Markdown
 
 # Links such as (method.md#what-is-logged).
 myst_heading_anchors = 3
+# The checklist of CONTRIBUTING.md.
+myst_enable_extensions = ["tasklist"]
 
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"

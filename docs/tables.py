@@ -1,24 +1,54 @@
-"""Puts tables of docs/results into the pages that show them: `python docs/tables.py` after results have changed.
+"""Fills the tables and the code that pages show from their sources: `python docs/tables.py` after a source has changed.
 
-A page says where a table belongs and where it ends: `<!-- table: results/X/returns.md -->` and `<!-- end -->`. The
-table `presets` is made from zoo_configs.
+A page names the source, and the script fills what lies between the two comments::
+
+    <!-- table: torcs-3000/headline.md rows: ddpg_ap:fast ddpg:default --> ... <!-- end -->
+    <!-- table: presets --> ... <!-- end -->
+    <!-- code: examples/quick_start.py --> ... <!-- end -->
+
+The first is the first table of a page of results, or the named rows of it in the order given; the second is made from
+zoo_configs; the third is a whole file.
 """
 
 import re
+import shlex
 from pathlib import Path
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.presets import algorithms, preset_names
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-TABLE = re.compile(r"(?P<begin><!-- table: (?P<path>\S+) -->\n)(?P<table>.*?)(?P<end><!-- end -->)", re.DOTALL)
+#: Where the pages of results are: the only place that says so to the markers.
+RESULTS = ROOT / "docs" / "results"
+PAGES = [
+    ROOT / "README.md",
+    *(page for folder in ("docs", "docs/algorithms") for page in sorted((ROOT / folder).glob("*.md"))),
+]
+MARKER = re.compile(
+    r"(?P<begin><!-- (?P<kind>table|code): (?P<source>\S+)(?: rows: (?P<rows>.+?))? -->\n).*?(?P<end><!-- end -->)",
+    re.DOTALL,
+)
 
 
-def first_table(path: Path) -> str:
-    """The first table of a page of results."""
+def first_table(path: Path) -> list[str]:
+    """The lines of the first table of a page of results."""
     after = f"\n{path.read_text(encoding='utf-8')}".partition("\n|")[2]
-    return f"|{after}".partition("\n\n")[0].strip()
+    return f"|{after}".partition("\n\n")[0].strip().splitlines()
+
+
+def table_of_results(source: str, rows: str | None) -> str:
+    """A table of results, or the rows whose first cells are given, as a shell would split them.
+
+    :raise ValueError: for a row that the table does not have
+    """
+    header, line, *body = first_table(RESULTS / source)
+    if rows is not None:
+        named = {row.split("|")[1].strip(): row for row in body}
+        wanted = shlex.split(rows)
+        if missing := [name for name in wanted if name not in named]:
+            raise ValueError(f"{source} has no row {missing[0]!r}: its rows are {', '.join(map(repr, named))}.")
+        body = [named[name] for name in wanted]
+    return "\n".join([header, line, *body])
 
 
 def table_of_presets() -> str:
@@ -32,17 +62,22 @@ def table_of_presets() -> str:
     return "\n".join(lines)
 
 
-def with_tables(page: Path) -> str:
-    """The text of a page, its tables as they should be."""
+def filled(page: Path) -> str:
+    """The text of a page with its tables and its code as their sources have them."""
 
-    def put(match: re.Match[str]) -> str:
-        of_presets = match["path"] == "presets"
-        table = table_of_presets() if of_presets else first_table(page.parent / match["path"])
-        return f"{match['begin']}\n{table}\n\n{match['end']}"
+    def fill(match: re.Match[str]) -> str:
+        if match["kind"] == "code":
+            code = (ROOT / match["source"]).read_text(encoding="utf-8")
+            return f"{match['begin']}```python\n{code}```\n{match['end']}"
+        if match["source"] == "presets":
+            content = table_of_presets()
+        else:
+            content = table_of_results(match["source"], match["rows"])
+        return f"{match['begin']}\n{content}\n\n{match['end']}"
 
-    return TABLE.sub(put, page.read_text(encoding="utf-8"))
+    return MARKER.sub(fill, page.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":
     for page in PAGES:
-        page.write_text(with_tables(page), encoding="utf-8")
+        page.write_text(filled(page), encoding="utf-8")

@@ -31,7 +31,7 @@ class Args:
     critic_learning_rate: float = 1e-3
     batch_size: int = 128
     t_k: int = 150  # steps that explore by noise
-    alpha: float = 0.9  # probability of consulting E, once it is good
+    alpha: float = 0.9  # probability of querying E, once it is accurate enough
     alpha_low: float = 0.5  # the same before that; the paper gives no value
     n_candidates: int = 128  # N
     knowledge_size: int = 10_000  # |K|

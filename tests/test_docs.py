@@ -11,10 +11,13 @@ from pathlib import Path
 import gymnasium as gym
 import matplotlib
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3 import DDPG
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from toy import CONSTRAINED, nearby
 
 import sb3_sap
 from sb3_sap import DDPGAP, envs, plots, zoo
@@ -24,20 +27,85 @@ from sb3_sap.cli.main import main, parser
 matplotlib.use("agg")
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES}
-LINKS = [(path, target) for path in PAGES for target in re.findall(r"\]\(((?!https?:)[^)#]+)", TEXTS[path.name])]
+DOCS = ROOT / "docs"
+FAMILIES = sorted((DOCS / "algorithms").glob("*.md"))
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted(DOCS.glob("*.md")),
+    *FAMILIES,
+]
 
 
-@pytest.mark.parametrize(("page", "target"), LINKS, ids=[f"{page.name}-{target}" for page, target in LINKS])
-def test_links_lead_somewhere(page, target):
-    assert (page.parent / target).exists()
+def name_of(page):
+    """A page of the site by its path in docs, another one by its path in the repository."""
+    return page.relative_to(DOCS if DOCS in page.parents else ROOT).as_posix()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_tables_are_those_of_the_results(page):
-    with_tables = runpy.run_path(str(ROOT / "docs" / "tables.py"))["with_tables"]
-    assert TEXTS[page.name] == with_tables(page)
+TEXTS = {name_of(page): page.read_text(encoding="utf-8") for page in PAGES}
+PAGE_IDS = list(TEXTS)
+LINKS = [
+    (page, target, anchor)
+    for page in PAGES
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)", TEXTS[name_of(page)])
+]
+
+
+def anchors(page):
+    """The anchors of a page's headings, as GitHub and MyST make them."""
+    headings = re.findall(
+        r"^#+ (.+)$", re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL), re.M
+    )
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize(
+    ("page", "target", "anchor"), LINKS, ids=[f"{name_of(page)}-{target}#{anchor}" for page, target, anchor in LINKS]
+)
+def test_links_lead_somewhere(page, target, anchor):
+    path = page.parent / target if target else page
+    assert path.exists()
+    assert not anchor or anchor in anchors(path)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=PAGE_IDS)
+def test_tables_and_code_are_those_of_their_sources(page):
+    filled = runpy.run_path(str(DOCS / "tables.py"))["filled"]
+    assert TEXTS[name_of(page)] == filled(page)
+
+
+def test_a_row_that_a_table_does_not_have_is_named(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("<!-- table: torcs-3000/headline.md rows: linear ddpg -->\n<!-- end -->\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="no row 'ddpg'"):
+        runpy.run_path(str(DOCS / "tables.py"))["filled"](page)
+
+
+# ---------------------------------------------------------------- the first screen
+
+TAGLINE = "A Stable-Baselines3 extension that learns which actions are permissible while it learns to act."
+
+
+@pytest.mark.parametrize("name", ["README.md", "setup.cfg", "CITATION.cff", "sb3_sap/__init__.py"])
+def test_the_tagline_is_the_same_everywhere(name):
+    assert TAGLINE in (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_site_begins_with_the_first_screen_of_the_readme():
+    options = dict(re.findall(r'^:(start-after|end-before): "(.+)"$', TEXTS["index.md"], re.MULTILINE))
+    after, before = options["start-after"], options["end-before"]
+    assert [TEXTS["README.md"].count(text) for text in (after, before)] == [1, 1]
+    screen = TEXTS["README.md"].partition(after)[2].partition(before)[0]
+    assert TAGLINE in screen
+    assert "def ap_function" in screen
+
+
+def test_the_ap_function_of_the_first_screen_is_that_of_lane_keeping():
+    names = {"np": np}
+    exec(SNIPPETS["README.md"][0], names)
+    obs, next_obs = np.random.default_rng(0).uniform(-1, 1, (2, 100, 5))
+    labels = names["ap_function"](obs, None, next_obs)
+    assert 20 < labels.sum() < 80
+    np.testing.assert_array_equal(labels, envs.ap_function(obs, None, next_obs))
 
 
 # ---------------------------------------------------------------- Python snippets
@@ -46,34 +114,42 @@ def test_tables_are_those_of_the_results(page):
 SNIPPETS = {
     name: re.findall(r"^ *```python\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE) for name, text in TEXTS.items()
 }
-FAST = {"README.md"}
+#: The scripts of the README; the other example has tests of its own.
+EXAMPLES = sorted(path for path in (ROOT / "examples").glob("*.py") if path.stem != "ddpg_ap_minimal")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[] if name in FAST else pytest.mark.slow)
-        for name, snippets in SNIPPETS.items()
-        if snippets
-    ],
-)
+def run_shortly(code, name, names, steps=300):
+    """Runs code with its training cut short."""
+    code, cuts = re.subn(r"\.learn\([\d_]+", f".learn({steps}", code)
+    exec(compile(code.replace(", progress_bar=True", ""), name, "exec"), names)
+    assert cuts == 0 or names["model"].num_timesteps == steps
+    return cuts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, snippets in SNIPPETS.items() if snippets])
 def test_snippets_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = {}
+    names = {"np": np} if name == "README.md" else {}  # whose first screen has a function alone
     for snippet in SNIPPETS[name]:
-        code, cuts = re.subn(r"\.learn\([\d_]+", ".learn(300", textwrap.dedent(snippet))
-        exec(compile(code.replace(", progress_bar=True", ""), name, "exec"), names)
-        assert cuts == 0 or names["model"].num_timesteps == 300
+        run_shortly(textwrap.dedent(snippet), name, names)
 
 
-def test_the_readme_has_its_three_snippets():
-    assert len(SNIPPETS["README.md"]) == 3
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run(example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run_shortly(example.read_text(encoding="utf-8"), example.name, {}, steps=120) == 1
+
+
+def test_the_readme_shows_every_example():
+    assert len(EXAMPLES) >= 2
+    assert SNIPPETS["README.md"][1:] == [path.read_text(encoding="utf-8") for path in EXAMPLES]
+    assert "](examples/ddpg_ap_minimal.py)" in TEXTS["README.md"]
 
 
 @pytest.mark.slow
 def test_the_readmes_own_problem_is_solved_as_it_says():
-    names = {}
-    exec(compile(SNIPPETS["README.md"][1], "README.md", "exec"), names)
+    names = runpy.run_path(str(ROOT / "examples" / "your_own_problem.py"))
     assert names["model"].num_timesteps == 1_000
     assert evaluate_policy(names["model"], Monitor(names["env"]), n_eval_episodes=5)[0] > 80
 
@@ -128,8 +204,10 @@ def test_commands_run_as_printed(tmp_path, monkeypatch):
 
 
 def test_every_public_name_is_in_the_reference():
-    named = set(re.findall(r"auto(?:class|function|data):: (?:[\w.]*\.)?(\w+)", TEXTS["api.md"]))
-    assert (set(sb3_sap.__all__) | set(envs.__all__) | set(plots.__all__)) - {"envs"} <= named
+    reference = "".join(TEXTS[name_of(page)] for page in (DOCS / "api.md", *FAMILIES))
+    named = re.findall(r"auto(?:class|function|data):: (?:[\w.]*\.)?(\w+)", reference)
+    assert (set(sb3_sap.__all__) | set(envs.__all__) | set(plots.__all__)) - {"envs"} <= set(named)
+    assert {cls.__name__ for cls in ALGORITHMS.values()} <= set(named)
 
 
 def test_every_parameter_is_told():
@@ -151,7 +229,7 @@ def test_the_defaults_told_are_those_of_the_constructor():
 
 
 def test_every_logged_metric_is_defined():
-    source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "sb3_sap").glob("*.py"))
+    source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "sb3_sap").rglob("*.py"))
     logged = set(re.findall(r'record(?:_mean)?\("((?:sap|train)/\w+)"', source))
     assert len(logged) >= 10
     assert logged <= set(re.findall(r"`((?:sap|train)/\w+)`", TEXTS["method.md"]))
@@ -159,6 +237,71 @@ def test_every_logged_metric_is_defined():
 
 def test_every_algorithm_has_its_row():
     assert {cls.__name__ for cls in ALGORITHMS.values()} <= set(re.findall(r"`(\w+)`", TEXTS["can_i_use_it.md"]))
+
+
+def test_the_chain_of_mixins_is_that_of_the_class():
+    [chain] = re.findall(r"```text\n(DDPGAP .*?)```", TEXTS["developer.md"], re.DOTALL)
+    drawn = [line.split()[0] for line in chain.splitlines()]
+    assert drawn == [cls.__name__ for cls in DDPGAP.__mro__ if cls.__module__ not in ("abc", "builtins")]
+
+
+# ---------------------------------------------------------------- the pages of the algorithms
+
+SPACES = {
+    "Discrete": spaces.Discrete(3),
+    "Box": spaces.Box(-1, 1, (2,), np.float32),
+    "MultiDiscrete": spaces.MultiDiscrete([2, 3]),
+    "MultiBinary": spaces.MultiBinary(3),
+    "Dict": spaces.Dict({"x": spaces.Box(-1, 1, (2,), np.float32)}),
+}
+
+
+class Anything(gym.Env):
+    """Observations and actions of any space, without a meaning."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {"permissible": True}
+
+
+def learns(cls, observation_space, action_space):
+    """Whether an algorithm takes these spaces."""
+    policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
+    settings = {"constraint": nearby} if cls in CONSTRAINED else {}
+    try:
+        model = cls(policy, Anything(observation_space, action_space), buffer_size=100, device="cpu", **settings)
+    except (AssertionError, ValueError):
+        return False
+    return model.learn(3).num_timesteps >= 3
+
+
+@pytest.mark.parametrize("page", FAMILIES, ids=lambda page: page.stem)
+def test_a_page_of_a_family_tells_which_spaces_it_takes(page):
+    text = TEXTS[name_of(page)]
+    rows = re.findall(r"^\| `(\w+)` \| ([✓✗]) \| ([✓✗]) \|$", text, re.MULTILINE)
+    assert [name for name, _, _ in rows] == list(SPACES)
+    for cls in (getattr(sb3_sap, name) for name in re.findall(r"autoclass:: (\w+)", text)):
+        own = SPACES["Discrete" if cls.discrete else "Box"]
+        takes = [(name, learns(cls, SPACES["Box"], space), learns(cls, space, own)) for name, space in SPACES.items()]
+        assert takes == [(name, action == "✓", observation == "✓") for name, action, observation in rows], cls
+
+
+@pytest.mark.parametrize("page", FAMILIES, ids=lambda page: page.stem)
+def test_a_page_of_a_family_has_the_sections_of_sb3s(page):
+    sections = re.findall(r"^## (.+)$", TEXTS[name_of(page)], re.MULTILINE)
+    assert sections == ["Notes", "Can I use?", "Example", "Results", "Parameters"]
+    assert f"algorithms/{page.stem}\n" in TEXTS["index.md"]
+
+
+def test_every_algorithm_is_on_one_page():
+    named = [name for page in FAMILIES for name in re.findall(r"autoclass:: (\w+)", TEXTS[name_of(page)])]
+    assert sorted(named) == sorted(cls.__name__ for cls in ALGORITHMS.values())
 
 
 # ---------------------------------------------------------------- notebooks

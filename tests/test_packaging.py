@@ -1,4 +1,7 @@
-"""What is published: the wheel that is built from the sdist works with what it declares, and with nothing else."""
+"""What is published: the wheel that is built from the sdist works with what it declares, and with nothing else.
+
+And how it is published: a release changes the version alone, or nothing.
+"""
 
 import configparser
 import os
@@ -14,6 +17,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
+
+import sb3_sap
 
 pytestmark = pytest.mark.slow
 
@@ -141,3 +146,104 @@ def test_it_works_with_each_extra_alone(site, extra, tmp_path):
     assert {"mypy", "pytest"} <= absent
     program = textwrap.dedent(ALONE).format(absent=absent, site=str(site)) + textwrap.dedent(PROGRAMS[extra])
     run("-c", program, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)})
+
+
+# ---------------------------------------------------------------- releases
+
+
+@pytest.fixture(scope="module")
+def repository(tmp_path_factory):
+    """A repository with a section for the release 0.2.0, which tests may clone."""
+    folder = tmp_path_factory.mktemp("repository")
+    kept = shutil.ignore_patterns(".git", ".venv*", "*.egg-info", "__pycache__", "build", "dist", "results", "_build")
+    shutil.copytree(ROOT, folder, ignore=kept, symlinks=True, dirs_exist_ok=True)
+    changelog = folder / "CHANGELOG.md"
+    text = changelog.read_text(encoding="utf-8")
+    assert text.count("## [Unreleased]\n") == 1
+    changelog.write_text(text.replace("[Unreleased]", "[0.2.0] - 2026-01-31"), encoding="utf-8")
+    git(folder, "init", "-q")
+    for name, value in (("user.name", "somebody"), ("user.email", "somebody@example.org")):
+        git(folder, "config", name, value)
+    commit(folder)
+    return folder
+
+
+@pytest.fixture
+def clone(repository, tmp_path):
+    shutil.copytree(repository, tmp_path / "clone", symlinks=True)
+    return tmp_path / "clone"
+
+
+def git(folder, *arguments):
+    return subprocess.run(["git", *arguments], cwd=folder, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def commit(folder):
+    git(folder, "add", "--all")
+    git(folder, "commit", "-q", "-m", "a change")
+
+
+def release(folder, version):
+    command = [sys.executable, str(folder / ".ci" / "release.py"), version]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def append(path, text):
+    path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
+
+
+def test_a_release_changes_the_version_builds_and_tags(clone):
+    before = git(clone, "rev-parse", "HEAD")
+    done = release(clone, "0.2.0")
+    assert done.returncode == 0, done.stderr
+    assert {path.name for path in (clone / "dist").iterdir()} == {
+        "sb3_sap-0.2.0-py3-none-any.whl",
+        "sb3_sap-0.2.0.tar.gz",
+    }
+    assert git(clone, "rev-parse", "HEAD~1") == before
+    changed = git(clone, "show", "v0.2.0^{commit}", "--format=", "--unified=0").splitlines()
+    lines = [line for line in changed if re.match(r"[+-](?![+-])", line)]
+    assert lines == [f'-__version__ = "{sb3_sap.__version__}"', '+__version__ = "0.2.0"']
+    assert git(clone, "status", "--porcelain") == ""
+    assert "### Added" in git(clone, "tag", "--list", "--format=%(contents)", "v0.2.0")
+
+
+def test_a_release_that_fails_changes_nothing(clone):
+    setup = clone / "setup.cfg"
+    text = setup.read_text(encoding="utf-8")
+    assert text.count("attr: sb3_sap.__version__") == 1
+    setup.write_text(text.replace("attr: sb3_sap.__version__", "0.1.9"), encoding="utf-8")
+    commit(clone)
+    before = git(clone, "rev-parse", "HEAD")
+    assert release(clone, "0.2.0").returncode != 0
+    assert git(clone, "rev-parse", "HEAD") == before
+    assert git(clone, "tag", "--list") == git(clone, "status", "--porcelain") == ""
+
+
+@pytest.mark.parametrize(
+    ("version", "change", "sentence"),
+    [
+        ("0.2", lambda clone: None, "three numbers such as 1.2.3, but is '0.2'"),
+        ("0.0.1", lambda clone: None, "0.0.1 is older than the current version"),
+        ("0.3.0", lambda clone: None, "no section '## [0.3.0] - YYYY-MM-DD' with entries"),
+        ("0.2.0", lambda clone: append(clone / "README.md", "more"), "uncommitted changes"),
+        ("0.2.0", lambda clone: git(clone, "tag", "v0.2.0"), "The tag v0.2.0 exists already"),
+    ],
+)
+def test_a_release_that_cannot_be_made_is_refused(clone, version, change, sentence):
+    change(clone)
+    before = git(clone, "rev-parse", "HEAD"), git(clone, "status", "--porcelain"), git(clone, "tag", "--list")
+    done = release(clone, version)
+    assert done.returncode == 1
+    assert sentence in done.stderr
+    assert before == (git(clone, "rev-parse", "HEAD"), git(clone, "status", "--porcelain"), git(clone, "tag", "--list"))
+    assert not (clone / "dist").exists()
+
+
+def test_a_section_without_entries_is_no_section(clone):
+    text = (clone / "CHANGELOG.md").read_text(encoding="utf-8")
+    (clone / "CHANGELOG.md").write_text(
+        text.replace("0.2.0", "0.1.0") + "\n## [0.2.0] - 2026-01-31\n", encoding="utf-8"
+    )
+    commit(clone)
+    assert "no section" in release(clone, "0.2.0").stderr

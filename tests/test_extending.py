@@ -52,7 +52,7 @@ def test_a_further_base_algorithm_takes_three_edits(copy):
     use(
         copy,
         """
-        from sb3_sap.cli import main
+        from sb3_sap.cli.main import main
         model = sb3_sap.OtherAP("MlpPolicy", "sap/LaneKeeping-v0", **sb3_sap.preset("default", sb3_sap.OtherAP))
         assert model.learn(50).num_timesteps == 50
         assert not main("train --algo other_ap --env sap/LaneKeeping-v0 -n 50 -f logs --eval-freq -1".split())
@@ -72,7 +72,7 @@ def test_a_further_task_takes_two_edits(copy):
     use(
         copy,
         """
-        from sb3_sap.cli import main
+        from sb3_sap.cli.main import main
         assert main("benchmark task CartPole-v1 --seeds 1 --out results".split()) == 0
         assert not main("train --algo dqn_ap --env CartPole-v1 -f logs --eval-freq -1".split())
         """,
@@ -92,7 +92,7 @@ def test_a_further_benchmark_configuration_takes_one_edit(copy):
     use(
         copy,
         """
-        from sb3_sap.cli import main
+        from sb3_sap.cli.main import main
         grid = "--simulator highway --steps 100 --seeds 1 --tracks eroad --out results"
         assert main(f"benchmark summary --columns mine {grid}".split()) == 0
         """,

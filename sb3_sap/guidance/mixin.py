@@ -15,16 +15,16 @@ class ActionPermissibilityMixin(AuxiliaryLossMixin):
 
     Goes before the algorithm in the bases of a class. Each class of the chain has one task, and passes on to the next::
 
-        ActionPermissibilityMixin         predict(guided=True)
-          AuxiliaryLossMixin              the auxiliary loss of actor or Q-values
-            GuidedExplorationMixin        Algorithm 1
-              LearnedPermissibilityMixin  labels, knowledge buffer K, AP predictor E
-                WatchedEnvironmentMixin   last observations as they were; warns of foreign steps
-              ConstrainedExplorationMixin constraints and permissible actions
-        SettingsMixin                     settings that SB3 lacks
-          EnvironmentMixin                spaces, wrappers, layouts
-          SavingMixin                     what files hold
-            DDPG, TD3, SAC, TQC, ...      the base algorithm
+        ActionPermissibilityMixin    predict(guided=True)
+        AuxiliaryLossMixin           the auxiliary loss of the actor or the Q-values
+        GuidedExplorationMixin       Algorithm 1
+        LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E
+        WatchedEnvironmentMixin      raw last observations, warnings about the training environment
+        ConstrainedExplorationMixin  constraints and permissible actions
+        SettingsMixin                settings that SB3 lacks
+        EnvironmentMixin             spaces, wrappers, layouts
+        SavingMixin                  what a file holds
+        DDPG, TD3, SAC, TQC, ...     the base algorithm
 
     ``predict`` is the policy alone unless ``guided=True`` is passed, so that every evaluation tool of SB3 measures
     what was learned; both buffers store the executed action.

@@ -123,9 +123,8 @@ def main() -> None:
             kind: build(networks, cls, kind, settings, options.device)
             for kind in ("base", "guided", "guided, rare fits")
         }
-        runs = [
-            {kind: milliseconds(model, on_gpu if cuda else on_cpu) for kind, model in models.items()} for _ in "123"
-        ]
+        steps = on_gpu if cuda else on_cpu
+        runs = [{kind: milliseconds(model, steps) for kind, model in models.items()} for _ in range(3)]
         medians = {kind: round(statistics.median(run[kind] for run in runs), 3) for kind in models}
         device = th.cuda.get_device_name() if cuda else "CPU, one thread"
         rows.append({"networks": networks, "algorithm": cls.__name__, "device": device, **medians})

@@ -1,8 +1,8 @@
-"""What an AP function gives without learning: a random permissible action at every step, found by trying each out.
+"""The look-ahead oracle: random permissible actions, each found by trying actions in a copy of the environment.
 
-The environment is copied, an action is taken in the copy, and the AP function says what it was. That is Algorithm 1
-with a predictor that never errs, and nothing else. It asks for a model of the environment, which a user seldom has; a
-learner that does no better has learned no more than its AP function says.
+It is Algorithm 1 with a predictor that never errs and without learning, and shows what an AP function gives by itself.
+It needs a model of the environment, which users seldom have. A learner that does no better has learned no more than its
+AP function contains.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_sap.benchmark.tasks import Episode
+from sb3_sap.benchmark.episodes import Episode
 from sb3_sap.evaluation import make_env
 from sb3_sap.permissibility import APFunction, ask, resolve
 
-#: Actions of a box that are tried before the last one is taken, permissible or not.
+#: Actions of a box that are tried; if none is permissible, the last one is executed.
 TRIES = 32
 
 
-def random_permissible(env_id: str, name: str, options: dict[str, Any], seeds: list[str], seed: int) -> list[list[Any]]:
-    """Drives an episode of each seed; rows that follow the checkpoint in ``RETURN_COLUMNS``.
+def oracle_episodes(env_id: str, name: str, options: dict[str, Any], seeds: list[str], seed: int) -> list[list[Any]]:
+    """Lets the oracle act for one episode of each seed.
 
     :param name: dotted name of the AP function
     :param options: of the environment
-    :param seed: of the draws
+    :param seed: of the random actions
+    :return: rows of ``RETURN_COLUMNS`` without the checkpoint
     """
     ap_function: APFunction = resolve(name, "ap_function")
     rng = np.random.default_rng(seed)
@@ -42,9 +43,9 @@ def random_permissible(env_id: str, name: str, options: dict[str, Any], seeds: l
 
 
 def _choose(env: Any, obs: Any, ap_function: APFunction, rng: np.random.Generator) -> Any:
-    for action in _in_random_order(env.action_space, rng):  # the last one stays, permissible or not
+    for action in _in_random_order(env.action_space, rng):
         next_obs = copy.deepcopy(env).step(action)[0]
-        if ask(ap_function, "ap_function", _one(obs), np.asarray(action)[None], _one(next_obs))[0]:
+        if ask(ap_function, "ap_function", _batch(obs), np.asarray(action)[None], _batch(next_obs))[0]:
             break
     return action
 
@@ -58,5 +59,5 @@ def _in_random_order(space: spaces.Space[Any], rng: np.random.Generator) -> Iter
             yield rng.uniform(space.low, space.high).astype(np.float32)
 
 
-def _one(obs: Any) -> Any:
+def _batch(obs: Any) -> Any:
     return {key: value[None] for key, value in obs.items()} if isinstance(obs, dict) else obs[None]

@@ -1,4 +1,4 @@
-"""Every result that section 5.2 of the paper states in a sentence: our figure, and a verdict by a stated rule."""
+"""The results that section 5.2 of the paper states in sentences, each with our figure and a verdict."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ from pathlib import Path
 
 import pandas as pd
 
-from sb3_sap.benchmark import verdicts
-from sb3_sap.benchmark.pages import made_by, markdown, write_text
-from sb3_sap.benchmark.results import Results
-from sb3_sap.benchmark.verdicts import AP, AP_CE2, CE1, CE2, DDPG, LONG_EPISODE, RISEN, SPEED, Judge, ordered
+from sb3_sap.benchmark.reports import verdicts
+from sb3_sap.benchmark.reports.pages import made_by, markdown, write_text
+from sb3_sap.benchmark.reports.results import Results
+from sb3_sap.benchmark.reports.verdicts import AP, AP_CE2, CE1, CE2, DDPG, LONG_EPISODE, RISEN, SPEED, Judge, ordered
 
-DEFINITIONS = f"""All figures are medians over seeds (of accuracies and rewards: means), of the paper's five algorithms
-with the paper's settings.
+DEFINITIONS = f"""All figures are those of the paper's five algorithms with the paper's settings, as medians over seeds
+(accuracies and rewards: as means).
 
-- *Moving average*: of the reward over the last 100 training steps; *risen* from {RISEN:.0%} of the default speed on,
-  {RISEN * SPEED:g} km/h; *stable from* the step after which it never falls below that again.
-- *Fluctuation*: standard deviation of the moving average over the second half of the training.
-- *Considerable distance*: an episode of {LONG_EPISODE} steps or more. *Lost*: an episode that ends off the road or
-  backwards.
+- The *moving average* is that of the reward over the last 100 training steps. It has *risen* when it reaches
+  {RISEN:.0%} of the default speed, {RISEN * SPEED:g} km/h, and is *stable* from the step after which it never falls
+  below that again.
+- The *fluctuation* is the standard deviation of the moving average over the second half of the training.
+- A *considerable distance* is an episode of {LONG_EPISODE} steps or more. An episode is *lost* if it ends with the car
+  off the road or facing backwards.
 """
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the paper, and how it is judged."""
+    """A sentence of the paper and the criterion by which it is judged."""
 
     sentence: str
-    steps: int  # of the training that the paper made for it
-    rule: str
+    steps: int  # of the paper's training
+    criterion: str
     judge: Judge
 
 
@@ -145,7 +146,10 @@ CLAIMS = [
 
 
 def judged(results: dict[int, Results]) -> pd.DataFrame:
-    """A row for every claim; those whose runs are not all of the five algorithms have no verdict."""
+    """A row for every claim; there is no verdict where results of one of the five algorithms are missing.
+
+    :param results: by training steps
+    """
     five = {DDPG, CE1, CE2, AP, AP_CE2}
     rows = []
     for claim in CLAIMS:
@@ -155,12 +159,12 @@ def judged(results: dict[int, Results]) -> pd.DataFrame:
         else:
             figure, good = claim.judge(found.only(sorted(five)))
             verdict = "**reproduced**" if good else "not reproduced"
-        rows.append([claim.sentence, f"{claim.steps:,}", claim.rule, figure, verdict])
+        rows.append([claim.sentence, f"{claim.steps:,}", claim.criterion, figure, verdict])
     return pd.DataFrame(rows, columns=["the paper says", "steps", "reproduced if", "ours", "verdict"])
 
 
 def claims(results: dict[int, Results], path: Path, command: str) -> None:
-    """Writes the page.
+    """Writes the page of all claims.
 
     :param results: by training steps
     """

@@ -1,4 +1,4 @@
-"""The results of a grid as tidy tables, one row for every lap, point of a curve or episode."""
+"""The results of a grid as tidy tables, with one row for every lap, time, point of a curve or episode."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from typing import Any
 
 import pandas as pd
 
-from sb3_sap.benchmark.cells import Cell, read_result
-from sb3_sap.benchmark.columns import Column
+from sb3_sap.benchmark.configurations import Configuration
+from sb3_sap.benchmark.runs import Run
+from sb3_sap.benchmark.store import read_result
 
 TABLES = ("laps", "times", "curve", "episodes")
 
 
 class NoResults(ValueError):
-    """Nothing to report."""
+    """There is nothing to report."""
 
 
 @dataclass
 class Results:
-    """What was found of a grid. Every table begins with the columns ``column`` and ``seed``."""
+    """The results that were found of a grid. Every table begins with the columns ``configuration`` and ``seed``."""
 
     simulator: str
     steps: int
-    columns: list[Column]  # those of which there is at least one run
-    missing: dict[str, int]  # runs that there are not, by column
+    configurations: list[Configuration]  # those with at least one result
+    missing: dict[str, int]  # number of runs without a result, by name of the configuration
     laps: pd.DataFrame
     times: pd.DataFrame
     curve: pd.DataFrame
@@ -34,43 +35,49 @@ class Results:
 
     @property
     def names(self) -> list[str]:
-        """The columns' names, in order."""
-        return [column.name for column in self.columns]
+        """Names of the configurations, in order."""
+        return [configuration.name for configuration in self.configurations]
 
     def final_laps(self) -> pd.DataFrame:
         """The laps after the whole training."""
-        last = self.laps.groupby("column")["checkpoint"].transform("max")
+        last = self.laps.groupby("configuration")["checkpoint"].transform("max")
         return self.laps[self.laps["checkpoint"] == last]
 
     def only(self, names: list[str]) -> Results:
-        """The same with some of the columns."""
+        """The results of some of the configurations."""
         kept = {table: _of(getattr(self, table), names) for table in TABLES}
-        columns = [column for column in self.columns if column.name in names]
+        configurations = [configuration for configuration in self.configurations if configuration.name in names]
         missing = {name: number for name, number in self.missing.items() if name in names}
-        return Results(self.simulator, self.steps, columns, missing, made=self.made, **kept)
+        return Results(self.simulator, self.steps, configurations, missing, made=self.made, **kept)
 
 
-def collect(grid: dict[Column, list[Cell]], folder: Path, simulator: str, steps: int) -> Results:
-    """Reads the results that there are."""
+def collect(grid: dict[Configuration, list[Run]], folder: Path, simulator: str, steps: int) -> Results:
+    """Reads the results of a grid.
+
+    :param folder: of the results
+    :raise NoResults: if there is none
+    """
     parts: dict[str, list[pd.DataFrame]] = {table: [] for table in TABLES}
-    made, missing, found_columns = [], {}, []
-    for column, cells in grid.items():
-        found = [(cell, result) for cell in cells if (result := read_result(cell, folder)) is not None]
+    made, missing, with_results = [], {}, []
+    for configuration, runs in grid.items():
+        found = [(run, result) for run in runs if (result := read_result(run, folder)) is not None]
         if found:
-            found_columns.append(column)
-        if len(found) < len(cells):
-            missing[column.name] = len(cells) - len(found)
-        for cell, result in found:
+            with_results.append(configuration)
+        if len(found) < len(runs):
+            missing[configuration.name] = len(runs) - len(found)
+        for run, result in found:
             made.append(result["made"])
             for table, rows in parts.items():
                 frame = pd.DataFrame(result[table]["data"], columns=result[table]["columns"])
-                frame.insert(0, "column", column.name)
-                frame.insert(1, "seed", cell.seed)
+                frame.insert(0, "configuration", configuration.name)
+                frame.insert(1, "seed", run.seed)
                 rows.append(frame)
     if not made:
-        raise NoResults(f"there are no results of these columns in {folder}: make them with `sb3-sap benchmark run`.")
+        raise NoResults(
+            f"there are no results of these configurations in {folder}: make them with `sb3-sap benchmark run`."
+        )
     tables = {table: _joined(frames) for table, frames in parts.items()}
-    return Results(simulator, steps, found_columns, missing, made=made, **tables)
+    return Results(simulator, steps, with_results, missing, made=made, **tables)
 
 
 def _joined(frames: list[pd.DataFrame]) -> pd.DataFrame:
@@ -79,4 +86,4 @@ def _joined(frames: list[pd.DataFrame]) -> pd.DataFrame:
 
 
 def _of(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
-    return table[table["column"].isin(names)].reset_index(drop=True)
+    return table[table["configuration"].isin(names)].reset_index(drop=True)

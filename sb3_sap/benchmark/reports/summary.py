@@ -1,4 +1,4 @@
-"""The summary of all columns: statistics of each, and how probably a guided one beats another."""
+"""Statistics of all configurations, and the probabilities that a guided one improves on others."""
 
 from __future__ import annotations
 
@@ -8,56 +8,61 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_sap.benchmark.columns import PEERS, Column
+from sb3_sap.benchmark.configurations import Configuration
+from sb3_sap.benchmark.groups import BASELINES
 from sb3_sap.benchmark.learners import environment_of
-from sb3_sap.benchmark.measures import (
+from sb3_sap.benchmark.reports.measures import (
     THRESHOLDS,
     median_reached,
     per_run,
     score_matrix,
     scores_with_interval,
 )
-from sb3_sap.benchmark.pages import markdown, write_csv, write_page
-from sb3_sap.benchmark.results import NoResults, Results
+from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_page
+from sb3_sap.benchmark.reports.results import NoResults, Results
 from sb3_sap.statistics import interquartile_mean, probability_of_improvement
 
 NOTE = (
-    "Laps and S are those after the whole training, on the unseen tracks, the actor alone; S is the interquartile mean "
-    "over seeds and tracks with its 95 % stratified bootstrap interval, the worst seed by its mean over the tracks. A "
-    "run is *competent* at the first checkpoint at which every unseen lap is done with S at or above the threshold: "
-    "the median over seeds, a run that never is counted as infinite, and how many are. Times are of the processor, "
-    "evaluation left out: as a run has one thread, they are what one waits where nothing else runs. Seconds count from "
-    "the start of the process, milliseconds from the first checkpoint on. Episodes off the road are those of the "
-    "training that end with the car off the road or backwards: medians over seeds. Accuracy is E's, balanced, on "
-    "validation examples.\n"
+    "Laps and S are those of the actor alone on the test tracks after the whole training. S is the interquartile mean "
+    "over seeds and tracks with its 95 % stratified bootstrap interval; the worst seed has the lowest mean over tracks. "
+    "A run is *competent* from the first checkpoint at which it completes every test lap with S at or above the "
+    "threshold. Steps and seconds until then are medians over seeds, in which a run that never gets there counts as "
+    "infinite, and the number of seeds that do is in brackets. Times are processor times without evaluations: since a "
+    "run has one thread, a user waits as long on an idle machine. Seconds count from the start of the process, "
+    "milliseconds from the first checkpoint. Episodes off the road are training episodes that end with the car off the "
+    "road or facing backwards, as medians over seeds. The accuracy of E is balanced, on validation examples.\n"
 )
 
 
 def summary(results: Results, folder: Path, command: str, name: str = "summary") -> None:
-    """Writes ``NAME.md``, ``NAME.csv`` with one row for every run, and ``NAME_improvement.csv`` of guided columns."""
-    if name != "summary" and len(results.columns) < 2:
+    """Writes ``NAME.md``, ``NAME.csv`` with a row for every run, and ``NAME_improvement.csv``.
+
+    :raise NoResults: if there are results of one configuration only, unless the name is "summary"
+    """
+    if name != "summary" and len(results.configurations) < 2:
         raise NoResults(
-            f"of these columns there are results of {results.names[0]} alone, and nothing to compare it with."
+            f"of these configurations, {results.names[0]} alone has results, which leaves nothing to compare."
         )
     runs = per_run(results)
     write_csv(folder / f"{name}.csv", runs.reset_index().round(6))
     laps = results.final_laps()
-    rows = [_summary_row(runs.loc[[column]], laps, column) for column in results.names]
+    rows = [_summary_row(runs.loc[[configuration]], laps, configuration) for configuration in results.names]
     parts = [markdown(pd.DataFrame(rows)), NOTE]
     improvements = improvement(results)
     if len(improvements):
         write_csv(folder / f"{name}_improvement.csv", improvements.round(6))
-        told = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
-        table = improvements.iloc[:, :2].assign(**{"probability of improvement": told})
-        parts += ["## How probably a guided run beats one of another column on an unseen track\n", markdown(table)]
-    title = f"{results.steps:,} training steps on Wheel-2, then the unseen tracks ({results.simulator})"
+        intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
+        table = improvements.iloc[:, :2].assign(**{"probability of improvement": intervals})
+        parts += ["## Probability that a guided run beats one of another configuration on a test track\n"]
+        parts += [markdown(table)]
+    title = f"{results.steps:,} training steps on Wheel-2, then the test tracks ({results.simulator})"
     write_page(folder / f"{name}.md", title, parts, results, command)
 
 
 def _summary_row(runs: pd.DataFrame, laps: pd.DataFrame, name: str) -> dict[str, str]:
     mean, low, high = scores_with_interval(laps, name)
     row = {
-        "column": name,
+        "configuration": name,
         "seeds": str(len(runs)),
         "laps done": f"{runs['laps_done'].sum()} of {runs['laps'].sum()}",
         "S": f"{mean:.3f} [{low:.3f}, {high:.3f}]" if len(runs) > 1 else f"{mean:.3f}",
@@ -85,23 +90,28 @@ def _number(value: float, digits: int = 0) -> str:
 
 
 def improvement(results: Results) -> pd.DataFrame:
-    """Each guided column against itself unchanged, its base and the best peer, in the same environment."""
+    """Compares each guided configuration with itself without overrides, its base and the best baseline.
+
+    Only configurations with the same options of the environment are compared.
+
+    :return: columns ``guided``, ``against``, ``probability``, ``low`` and ``high``
+    """
     laps = results.final_laps()
     rows = []
-    for ours in results.columns:
+    for ours in results.configurations:
         if "_ap" not in ours.algo:
             continue
-        alike = [column for column in results.columns if environment_of(column) == environment_of(ours)]
-        peers = [c for c in alike if c.algo in PEERS and c.preset in ("default", "tuned")]
-        best = max(peers, key=lambda peer: interquartile_mean(score_matrix(laps, peer.name)), default=None)
+        alike = [other for other in results.configurations if environment_of(other) == environment_of(ours)]
+        baselines = [other for other in alike if other.algo in BASELINES and other.preset in ("default", "tuned")]
+        best = max(baselines, key=lambda one: interquartile_mean(score_matrix(laps, one.name)), default=None)
         base = ours.algo.partition("_ap")[0]
-        others = [column for column in alike if column.algo == base]
+        others = [other for other in alike if other.algo == base]
         if ours.preset == "paper":
-            others = [column for column in others if column.preset == "paper"] or others
-        others = [column for column in others if column.overrides == ours.overrides] or others
-        unchanged = [c for c in alike if ours.overrides and c == Column(ours.algo, ours.preset)]
+            others = [other for other in others if other.preset == "paper"] or others
+        others = [other for other in others if other.overrides == ours.overrides] or others
+        unchanged = [other for other in alike if ours.overrides and other == Configuration(ours.algo, ours.preset)]
         for other in dict.fromkeys([*unchanged, *others, *([best] if best else [])]):
             estimate = probability_of_improvement(score_matrix(laps, ours.name), score_matrix(laps, other.name))
-            best_mark = " (best peer)" if other == best else ""
+            best_mark = " (best baseline)" if other == best else ""
             rows.append([ours.name, other.name + best_mark, *estimate])
     return pd.DataFrame(rows, columns=["guided", "against", "probability", "low", "high"])

@@ -1,4 +1,4 @@
-"""How the claims of the paper are judged: measures of the five algorithms' runs, and verdicts by a stated rule."""
+"""Judges the claims of the paper: measures of its five algorithms, and criteria on them."""
 
 from __future__ import annotations
 
@@ -7,42 +7,42 @@ from collections.abc import Callable
 
 import pandas as pd
 
-from sb3_sap.benchmark.figures import ACCURACY_STEPS, with_averages
-from sb3_sap.benchmark.measures import median_reached
-from sb3_sap.benchmark.results import Results
+from sb3_sap.benchmark.reports.figures import ACCURACY_STEPS, with_averages
+from sb3_sap.benchmark.reports.measures import median_reached
+from sb3_sap.benchmark.reports.results import Results
 from sb3_sap.statistics import interquartile_mean
 
 DDPG, CE1, CE2, AP, AP_CE2 = (f"{algo}:paper" for algo in ("ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap", "ddpg_ap_ce2"))
+#: Default speed in km/h, which is the reward of a perfect step.
 SPEED = 50.0
-"""km/h, the default speed and the reward of a perfect step."""
+#: Share of that speed from which a moving average counts as risen.
 RISEN = 0.8
-"""Share of it from which a moving average counts as risen; and below which it has fallen again."""
+#: Steps of a training episode that are "a considerable amount of distance": 1.4 km.
 LONG_EPISODE = 500
-"""Steps of a training episode that make "a considerable amount of distance": 1.4 km."""
 
-#: Our figure, in words, and whether it bears the claim out.
+#: A function of results that returns our figure in words, and whether it confirms the claim.
 Judge = Callable[[Results], tuple[str, bool]]
-#: A figure of each column.
+#: A function of results that returns a figure of each configuration by name.
 Measure = Callable[[Results], dict[str, float]]
 
 
 def medians(values: pd.Series) -> dict[str, float]:
-    """Median over the seeds of each column; ``values`` is indexed by column and seed."""
-    return {str(name): median_reached(runs)[0] for name, runs in values.groupby(level="column", sort=False)}
+    """Median over the seeds of each configuration; ``values`` is indexed by configuration and seed."""
+    return {str(name): median_reached(runs)[0] for name, runs in values.groupby(level="configuration", sort=False)}
 
 
 def risen_at(results: Results) -> dict[str, float]:
-    """The step at which the moving average has risen; infinite if it never has."""
+    """The step at which the moving average has risen, or infinity."""
     curve = results.curve
     step = curve["step"].where((curve["reward"] >= RISEN * SPEED) & (curve["step"] >= 100), math.inf)
-    return medians(step.groupby([curve["column"], curve["seed"]]).min())
+    return medians(step.groupby([curve["configuration"], curve["seed"]]).min())
 
 
 def stable_from(results: Results) -> dict[str, float]:
-    """The step from which the moving average stays risen; infinite if it has fallen at the end."""
+    """The step from which the moving average remains risen, or infinity if it ends below."""
     curve = results.curve.sort_values("step")
-    low = curve[curve["reward"] < RISEN * SPEED].groupby(["column", "seed"])["step"].max()
-    keys = [curve["column"], curve["seed"]]
+    low = curve[curve["reward"] < RISEN * SPEED].groupby(["configuration", "seed"])["step"].max()
+    keys = [curve["configuration"], curve["seed"]]
     end = curve.groupby(keys)["step"].max()
     last_low = low.reindex(end.index).fillna(0).astype(float)
     return medians(last_low.where(last_low < end, math.inf))
@@ -51,36 +51,36 @@ def stable_from(results: Results) -> dict[str, float]:
 def fluctuation(results: Results) -> dict[str, float]:
     """Standard deviation of the moving average in the second half."""
     late = results.curve[results.curve["step"] > results.curve["step"].max() / 2]
-    return medians(late.groupby(["column", "seed"])["reward"].std(ddof=0))
+    return medians(late.groupby(["configuration", "seed"])["reward"].std(ddof=0))
 
 
 def first_long_episode(results: Results) -> dict[str, float]:
     """The number of the first episode over a considerable distance."""
     episodes = with_averages(results.episodes)
     number = episodes["episode"].where(episodes["length"] >= LONG_EPISODE, math.inf)
-    return medians(number.groupby([episodes["column"], episodes["seed"]]).min())
+    return medians(number.groupby([episodes["configuration"], episodes["seed"]]).min())
 
 
 def last_lost_episode(results: Results) -> pd.Series:
-    """The number of the last episode in which the car was lost, by column and seed; 0 if there is none."""
+    """The number of the last episode in which the car was lost, or 0; by configuration and seed."""
     episodes = with_averages(results.episodes)
     number = episodes["episode"].where(episodes["lost"], 0)
-    return number.groupby([episodes["column"], episodes["seed"]]).max()
+    return number.groupby([episodes["configuration"], episodes["seed"]]).max()
 
 
 def laps(results: Results, name: str) -> tuple[int, int]:
-    """Laps done of all, after the whole training."""
-    done = results.final_laps().query("column == @name")["lap_done"]
+    """Number of laps that were completed after the whole training, and number of laps."""
+    done = results.final_laps().query("configuration == @name")["lap_done"]
     return int(done.sum()), len(done)
 
 
 def rewards(results: Results) -> pd.DataFrame:
-    """Interquartile mean of the total reward over seeds: columns by track."""
-    by = results.final_laps().groupby(["column", "track"], sort=False)["total_reward"]
+    """Interquartile mean of the total reward over seeds: one row per configuration, one column per track."""
+    by = results.final_laps().groupby(["configuration", "track"], sort=False)["total_reward"]
     return by.apply(lambda total: interquartile_mean(total.to_numpy())).unstack()
 
 
-def _told(figures: dict[str, float], digits: int = 0) -> str:
+def _in_words(figures: dict[str, float], digits: int = 0) -> str:
     return ", ".join(
         f"{name.partition(':')[0]} {'never' if math.isinf(value) else f'{value:,.{digits}f}'}"
         for name, value in figures.items()
@@ -88,30 +88,35 @@ def _told(figures: dict[str, float], digits: int = 0) -> str:
 
 
 def smallest(measure: Measure, name: str, limit: float = math.inf) -> Judge:
+    """Whether the measure of a configuration is below that of all others, and at most ``limit``."""
+
     def judge(results: Results) -> tuple[str, bool]:
         figures = measure(results)
         others = [value for other, value in figures.items() if other != name]
-        return _told(figures), figures[name] < min(others) and figures[name] <= limit
+        return _in_words(figures), figures[name] < min(others) and figures[name] <= limit
 
     return judge
 
 
 def ordered(measure: Measure, *pairs: tuple[str, str], factor: float = 1.0, digits: int = 0) -> Judge:
-    """For every pair, the measure of the first is below that of the second over ``factor``."""
+    """Whether, in every pair, ``factor`` times the measure of the first is below that of the second."""
 
     def judge(results: Results) -> tuple[str, bool]:
         figures = measure(results)
-        return _told(figures, digits), all(factor * figures[a] < figures[b] for a, b in pairs)
+        return _in_words(figures, digits), all(factor * figures[a] < figures[b] for a, b in pairs)
 
     return judge
 
 
 def more_than_120(results: Results) -> tuple[str, bool]:
+    """Whether DDPG's first long episode comes after the 120th."""
     number = first_long_episode(results)[DDPG]
-    return _told({DDPG: number}), number > 120
+    return _in_words({DDPG: number}), number > 120
 
 
 def never_lost_after(name: str, limit: int) -> Judge:
+    """Whether, in every seed, no episode after number ``limit`` is lost."""
+
     def judge(results: Results) -> tuple[str, bool]:
         last = last_lost_episode(results)[name]
         within = int((last <= limit).sum())
@@ -122,10 +127,11 @@ def never_lost_after(name: str, limit: int) -> Judge:
 
 def _accuracy(results: Results) -> pd.DataFrame:
     curve = results.curve[(results.curve["step"] <= ACCURACY_STEPS) & results.curve["accuracy"].notna()]
-    return curve[curve["column"] == AP].astype({"accuracy": float, "lowest_accuracy": float})
+    return curve[curve["configuration"] == AP].astype({"accuracy": float, "lowest_accuracy": float})
 
 
 def always_above_70(results: Results) -> tuple[str, bool]:
+    """Whether no validation of E has an accuracy below 70 %."""
     curve = _accuracy(results)
     share = (curve["accuracy"] >= 0.7).mean()
     lowest = curve["lowest_accuracy"].min()
@@ -133,12 +139,13 @@ def always_above_70(results: Results) -> tuple[str, bool]:
 
 
 def average_80(results: Results) -> tuple[str, bool]:
+    """Whether the mean accuracy of E rounds to 80 % or more."""
     mean = _accuracy(results)["accuracy"].mean()
     return f"{mean:.1%}", mean >= 0.795
 
 
 def laps_done(expected: dict[str, bool]) -> Judge:
-    """Whether each column completes all of its laps, or, where that is expected, not all."""
+    """Whether each configuration completes all of its laps where True is expected, and misses some where False is."""
 
     def judge(results: Results) -> tuple[str, bool]:
         found = {name: laps(results, name) for name in expected}
@@ -149,11 +156,13 @@ def laps_done(expected: dict[str, bool]) -> Judge:
 
 
 def no_lap(results: Results) -> tuple[str, bool]:
+    """Whether DDPG completes no lap."""
     done, total = laps(results, DDPG)
     return f"{done} of {total}", done == 0
 
 
 def ce1_low(results: Results) -> tuple[str, bool]:
+    """Whether DDPG-CE1 completes all laps with less than 60 % of DDPG-AP's reward."""
     done, total = laps(results, CE1)
     means = rewards(results).mean(axis=1)
     share = means[CE1] / means[AP]
@@ -161,7 +170,8 @@ def ce1_low(results: Results) -> tuple[str, bool]:
 
 
 def ce2_but_spring(results: Results) -> tuple[str, bool]:
-    final = results.final_laps().query("column == @CE2", local_dict={"CE2": CE2})
+    """Whether DDPG-CE2 misses laps of Spring and of no other track."""
+    final = results.final_laps().query("configuration == @CE2", local_dict={"CE2": CE2})
     by_track = final.groupby("track")["lap_done"].agg(["sum", "size"])
     spring = by_track.loc["spring"]
     others = by_track.drop("spring")
@@ -170,6 +180,8 @@ def ce2_but_spring(results: Results) -> tuple[str, bool]:
 
 
 def highest(name: str) -> Judge:
+    """Whether a configuration has the highest reward on every track."""
+
     def judge(results: Results) -> tuple[str, bool]:
         totals = rewards(results)
         best = {str(track): str(totals[track].idxmax()) for track in totals}
@@ -180,6 +192,7 @@ def highest(name: str) -> Judge:
 
 
 def ce2_below(results: Results) -> tuple[str, bool]:
+    """Whether DDPG-CE2's mean reward is below those of DDPG-AP and DDPG-(AP+CE2)."""
     means = rewards(results).mean(axis=1)
     figures = {name: float(means[name]) for name in (CE2, AP, AP_CE2)}
-    return _told(figures), figures[CE2] < min(figures[AP], figures[AP_CE2])
+    return _in_words(figures), figures[CE2] < min(figures[AP], figures[AP_CE2])

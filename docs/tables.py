@@ -1,7 +1,7 @@
-"""Puts tables of docs/results into the pages that show them: `python docs/tables.py` after results have changed.
+"""Puts tables of results into the pages that show them: `python docs/tables.py` after results have changed.
 
-A page says where a table belongs and where it ends: `<!-- table: results/X/returns.md -->` and `<!-- end -->`. The
-table `presets` is made from zoo_configs.
+A page says where a table begins and ends: `<!-- table: results/X/returns.md -->` and `<!-- end -->`. The table `presets`
+is made from zoo_configs.
 """
 
 import re
@@ -37,7 +37,7 @@ def with_tables(page: Path) -> str:
 
     def put(match: re.Match[str]) -> str:
         of_presets = match["path"] == "presets"
-        table = table_of_presets() if of_presets else first_table(page.parent / match["path"])
+        table = table_of_presets() if of_presets else first_table(ROOT / match["path"])
         return f"{match['begin']}\n{table}\n\n{match['end']}"
 
     return TABLE.sub(put, page.read_text(encoding="utf-8"))

@@ -1,6 +1,6 @@
-"""Control steps per second of sap/LaneKeeping-v0 through the whole Gymnasium stack, on one core.
+"""Measures control steps per second of sap/LaneKeeping-v0 through the whole Gymnasium stack, on one core.
 
-python benchmarks/bench_lane_keeping.py [TRACK] [STEPS]
+python measurements/lane_keeping_speed.py [TRACK] [STEPS]
 """
 
 import sys
@@ -13,7 +13,7 @@ from sb3_sap.envs.lane_keeping import STEERING_LOCK  # importing sb3_sap registe
 
 
 def main(track: str = "wheel-2", steps: int = 20_000) -> None:
-    """Drive with linear feedback, which stays on the road, and print the rate."""
+    """Drives with linear feedback, which remains on the road, and prints the rate."""
     env = gym.make("sap/LaneKeeping-v0", track=track, laps=None)
     obs, _ = env.reset(seed=0)
     gains = np.array([2.5 / STEERING_LOCK, -1.6, 0.0, 1.0, 0.0], dtype=np.float32)

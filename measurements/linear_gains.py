@@ -1,6 +1,6 @@
-"""Gains of the linear feedback controller: the best of a grid on Wheel-2, refined from there; no other track is driven.
+"""Searches the gains of linear feedback: the best of a grid on Wheel-2, then refined; no other track is driven.
 
-python benchmarks/linear_gains.py highway|torcs   # prints the gains for sb3_sap/benchmark/linear.py
+python measurements/linear_gains.py highway|torcs   # prints the gains for sb3_sap/benchmark/linear.py
 """
 
 import itertools
@@ -18,7 +18,7 @@ REFINEMENTS = 80
 
 
 def main(simulator: str) -> None:
-    """Search, and print S and the gains, rounded to what they matter."""
+    """Searches, and prints S and the gains, rounded to one decimal."""
     env = lap_env("wheel-2", simulator)
 
     def loss(gains) -> float:

@@ -1,8 +1,9 @@
-"""What the AP functions of Pendulum say of random actions, and of a good policy's own: SAC that no label has touched.
+"""Measures how the AP functions of Pendulum label random actions and those of a good policy.
 
-Trains `sac:task`, the unguided base of the table, and lets check_permissibility look at each AP function with it.
+The policy is `sac:task`, the base without guidance, whose training no label influences. It is trained, and
+`check_permissibility` examines each AP function with it.
 
-python benchmarks/pendulum_labels.py [--seeds 3] [--out docs/results/Pendulum-v1/labels.csv]
+python measurements/pendulum_labels.py [--seeds 3] [--out results/Pendulum-v1/labels.csv]
 """
 
 import argparse
@@ -12,11 +13,11 @@ import pandas as pd
 import torch as th
 
 from sb3_sap import check_permissibility
-from sb3_sap.benchmark.cells import make_cell
-from sb3_sap.benchmark.columns import parse_column
+from sb3_sap.benchmark.configurations import parse_configuration
 from sb3_sap.benchmark.learners import make_model
-from sb3_sap.benchmark.pages import markdown, write_csv, write_text
-from sb3_sap.benchmark.tasks import planned_steps
+from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_text
+from sb3_sap.benchmark.runs import make_run
+from sb3_sap.benchmark.task_settings import planned_steps
 from sb3_sap.evaluation import make_env
 
 TASK = "Pendulum-v1"
@@ -24,13 +25,13 @@ NAMES = ("pendulum_height", "pendulum_torque", "pendulum_energy")
 
 
 def main(seeds: int, out: Path) -> None:
-    """Trains and looks, seed by seed, and writes the rows and the table of their means."""
+    """Trains and examines, seed by seed, and writes the rows and a table of their means."""
     th.set_num_threads(1)
     rows = []
     for seed in range(seeds):
-        cell = make_cell(parse_column("sac:task"), TASK, planned_steps(TASK), seed)
-        model = make_model(cell.algo, make_env(TASK, **cell.training), cell.settings, seed)
-        model.learn(cell.steps)
+        run = make_run(parse_configuration("sac:task"), TASK, planned_steps(TASK), seed)
+        model = make_model(run.algo, make_env(TASK, **run.training), run.settings, seed)
+        model.learn(run.steps)
         for name in NAMES:
             report = check_permissibility(
                 make_env(TASK), f"sb3_sap.tasks.{name}", policy=model, seed=seed, verbose=False
@@ -53,6 +54,6 @@ def main(seeds: int, out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/Pendulum-v1/labels.csv"))
+    parser.add_argument("--out", type=Path, default=Path("results/Pendulum-v1/labels.csv"))
     arguments = parser.parse_args()
     main(arguments.seeds, arguments.out)

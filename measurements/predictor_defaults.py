@@ -1,9 +1,10 @@
-"""Which settings train the AP predictor best: the paper's against this package's defaults and its neighbours.
+"""Measures which settings fit the AP predictor best: the paper's, this package's defaults, and their neighbours.
 
-Trains DDPG-AP on sap/LaneKeeping-v0 (Wheel-2) with everything else at the constructor's defaults, and compares E's
-balanced validation accuracy between steps 500 and 2,000 and the processor time per step. Tuning seeds, never reported.
+DDPG-AP is trained on sap/LaneKeeping-v0 (Wheel-2) with the constructor's defaults of everything else. The balanced
+validation accuracy of E between steps 500 and 2,000 and the processor time per step are compared. The seeds are those
+for tuning, from 100 on.
 
-python benchmarks/predictor_defaults.py [--seeds 3] [--out docs/results/predictor_defaults.csv]
+python measurements/predictor_defaults.py [--seeds 3] [--out results/predictor_defaults.csv]
 """
 
 import argparse
@@ -18,7 +19,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sap import DDPGAP
-from sb3_sap.benchmark.pages import markdown
+from sb3_sap.benchmark.reports.pages import markdown
 from sb3_sap.files import atomic_path
 
 STEPS, FROM = 2_000, 500
@@ -52,7 +53,7 @@ class Accuracy(BaseCallback):
 
 
 def main(seeds: int, out: Path) -> None:
-    """Run every setting with every seed, write each row as it ends, print the means."""
+    """Trains with every setting and seed, writes each row as it ends, and prints the means."""
     th.set_num_threads(1)
     rows = []
     for seed in range(FIRST_SEED, FIRST_SEED + seeds):
@@ -85,6 +86,6 @@ def main(seeds: int, out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/predictor_defaults.csv"))
+    parser.add_argument("--out", type=Path, default=Path("results/predictor_defaults.csv"))
     options = parser.parse_args()
     main(options.seeds, options.out)

@@ -1,11 +1,11 @@
-"""Why DDPG-AP with the paper's settings may spin at the standing start: what E says there, and what follows.
+"""Measures what E predicts at the standing start, where DDPG-AP with the paper's settings may spin.
 
-Trains with the paper's settings on TORCS' Wheel-2, with E as the paper trains it and with E as this package does by
-default, and looks after 500 steps at the first two seconds of a lap from standstill, the actor steering: the *spread*
-of E's probability over five steering angles (how much the action matters to E) and the share of steps at which E would
-let the actor's own action pass though it was a mistake. Seeds 0 to 9: it explains the runs that are reported.
+DDPG-AP is trained for 500 steps with the paper's settings on TORCS' Wheel-2, with E fitted as in the paper and with E
+fitted as by default. Then the actor steers the first two seconds of a lap from standstill. Two things are measured: the
+*spread* of E's probability over five steering angles, which is how much the action matters to E, and the share of the
+actor's mistakes that E would permit (*passed*). The seeds are 0 to 9, those of the runs that this explains.
 
-python benchmarks/standing_start.py [--seeds 10] [--out docs/results/standing_start.csv]
+python measurements/standing_start.py [--seeds 10] [--out results/standing_start.csv]
 """
 
 import argparse
@@ -17,26 +17,26 @@ import pandas as pd
 import torch as th
 
 from sb3_sap.beliefs import permissible_probability
-from sb3_sap.benchmark.cells import make_cell
-from sb3_sap.benchmark.columns import parse_column
+from sb3_sap.benchmark.configurations import parse_configuration
 from sb3_sap.benchmark.learners import make_model
-from sb3_sap.benchmark.pages import markdown, write_csv, write_text
+from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_text
+from sb3_sap.benchmark.runs import make_run
 from sb3_sap.evaluation import ENVIRONMENTS, lap, lap_env, make_env
 
 STEPS, TRACK = 500, "g-track-1"
 LOOK = 10  # control steps of 0.2 s, two seconds
 STEERING = np.linspace(-1, 1, 5, dtype=np.float32)[:, None]
-COLUMNS = {
+CONFIGURATIONS = {
     "E as in the paper": "ddpg_ap:paper",
     "E with Adam 0.001, λ 0.0001": "ddpg_ap:paper[predictor_kwargs.optimizer_class=Adam,"
     "predictor_kwargs.learning_rate=0.001,predictor_kwargs.weight_decay=0.0001]",
 }
 
 
-def look(column: str, seed: int) -> dict[str, float]:
-    """Trains one model and returns what E and the actor do at the standing start."""
-    cell = make_cell(parse_column(column), "torcs", 3_000, seed)  # t_k is that of a run of 3,000 steps
-    model: Any = make_model(cell.algo, make_env(ENVIRONMENTS["torcs"], **cell.training), cell.settings, seed)
+def measure(configuration: str, seed: int) -> dict[str, float]:
+    """Trains one model and measures E and the actor at the standing start."""
+    run = make_run(parse_configuration(configuration), "torcs", 3_000, seed)  # t_k is that of a run of 3,000 steps
+    model: Any = make_model(run.algo, make_env(ENVIRONMENTS["torcs"], **run.training), run.settings, seed)
     model.learn(STEPS)
     env = lap_env(TRACK, "torcs")
     obs, _ = env.reset(seed=0)
@@ -61,12 +61,12 @@ def look(column: str, seed: int) -> dict[str, float]:
 
 
 def main(seeds: int, out: Path) -> None:
-    """Runs every setting and seed, writes each row as it ends, then the table."""
+    """Measures every configuration and seed, and writes each row as it ends, then the table."""
     th.set_num_threads(1)
     rows = []
     for seed in range(seeds):
-        for name, column in COLUMNS.items():
-            rows.append({"predictor": name, "seed": seed} | look(column, seed))
+        for name, configuration in CONFIGURATIONS.items():
+            rows.append({"predictor": name, "seed": seed} | measure(configuration, seed))
             print(rows[-1], flush=True)
             write_csv(out, pd.DataFrame(rows).round(4))
     table = pd.DataFrame(rows).assign(failed=lambda rows: rows["score"] < 0.1)
@@ -78,6 +78,6 @@ def main(seeds: int, out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--out", type=Path, default=Path("docs/results/standing_start.csv"))
+    parser.add_argument("--out", type=Path, default=Path("results/standing_start.csv"))
     options = parser.parse_args()
     main(options.seeds, options.out)

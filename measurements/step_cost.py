@@ -1,14 +1,14 @@
-"""What guidance costs for each training step: every guided algorithm beside its own base at equal settings.
+"""Measures what guidance costs per training step: every guided algorithm beside its base with the same settings.
 
-First with the settings of presets, then, with ``--bare``, as the constructors give them: SB3's defaults and ours.
+The first table has the settings of presets; with ``--bare`` it has the defaults of the constructors, SB3's and ours.
 
-The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that whatever else
-the machine does meets both; processor time is counted, over all of a run but its first 50 steps, which are random. The
-parts are measured inside the guided model. Below the cost of fitting E lies that of its matrix products alone, which no
-other way of writing the same fit avoids.
+The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that other work on the
+machine affects both. Processor time is measured over the whole training but its first 50 steps, whose actions are
+random. The parts are measured inside the guided model. The matrix products of E are a lower bound of the cost of fitting
+it, which no other implementation of the same fit avoids.
 
-python benchmarks/bench_step_cost.py [--pairs ddpg:fast 'td3:fast[teaching_growth=0]' …]   # writes .csv and .md
-python benchmarks/bench_step_cost.py --bare   # writes a further .csv and the second table of the .md
+python measurements/step_cost.py [--pairs ddpg:fast 'td3:fast[teaching_growth=0]' …]   # writes .csv and .md
+python measurements/step_cost.py --bare   # writes a further .csv and the second table of the .md
 """
 
 import argparse
@@ -24,21 +24,21 @@ import torch as th
 
 import sb3_sap.exploration
 from sb3_sap.algorithms import ALGORITHMS
-from sb3_sap.benchmark.columns import Column, parse_column
+from sb3_sap.benchmark.configurations import Configuration, parse_configuration
 from sb3_sap.benchmark.learners import algorithm_class, make_model, settings_of
-from sb3_sap.benchmark.pages import markdown, write_csv, write_text
 from sb3_sap.benchmark.provenance import provenance
+from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_text
 from sb3_sap.callbacks import PermissibilityCallback
 
 PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
     *("td3:fast[teaching_growth=null]", "sac:fast[teaching_growth=0]"),
 )
-#: Bases with the constructors' own settings; those of finite actions drive up a hill, the others a car on TORCS.
+#: Bases for ``--bare``; those with discrete actions learn MountainCar, the others lane keeping on TORCS.
 BARE = ("ddpg", "td3", "sac", "tqc", "crossq", "dqn", "qrdqn")
 HEADINGS = ("# With the settings of presets", "# As the constructors give them")
 CHUNK = 50
-PARTS = ("fit E", "validate E", "teach the actor", "Algorithm 1")
+PARTS = ("fit E", "validate E", "auxiliary loss", "Algorithm 1")
 seconds: defaultdict[str, float] = defaultdict(float)
 
 
@@ -59,12 +59,12 @@ def watch_the_parts() -> None:
     callback.validate = timed("validate E", callback.validate)
     guided: Any = sb3_sap.exploration.ActionPermissibilityMixin
     guided._guide = timed("Algorithm 1", guided._guide)
-    sb3_sap.exploration.permissible_actor_step = timed("teach the actor", sb3_sap.exploration.permissible_actor_step)
+    sb3_sap.exploration.permissible_actor_step = timed("auxiliary loss", sb3_sap.exploration.permissible_actor_step)
 
 
 def build(algo: str, settings: dict):
     env = gym.make("sap/TorcsLaneKeeping-v0", track="wheel-2", laps=None)
-    known = inspect.signature(algorithm_class(algo)).parameters  # a base takes what it knows of its guided settings
+    known = inspect.signature(algorithm_class(algo)).parameters  # a base has no settings of guidance
     return make_model(algo, env, {name: value for name, value in settings.items() if name in known}, seed=100)
 
 
@@ -87,27 +87,27 @@ def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
         for number, (weight, x, y) in enumerate(zip(layers, inputs, outputs, strict=True)):
             x @ weight.t()
             y.t() @ x
-            if number:  # nobody asks for the gradient of the observation
+            if number:  # the gradient of the observation is not needed
                 y @ weight
     return (time.process_time() - begun) / repeats
 
 
 def measure(pair: str, steps: int) -> dict[str, object]:
-    """One row: milliseconds a step of both models, and of the guided one's parts."""
+    """One row: milliseconds per step of both models, and of the parts of the guided one."""
     if pair in BARE:
         models = [build_bare(algo) for algo in (pair, f"{pair}_ap")]
     else:
-        column = parse_column(pair)
-        guided = Column(f"{column.algo}_ap", column.preset, column.overrides)
+        base = parse_configuration(pair)
+        guided = Configuration(f"{base.algo}_ap", base.preset, base.overrides)
         settings = settings_of(guided, "torcs", steps)
-        models = [build(algo, settings) for algo in (column.algo, guided.algo)]
+        models = [build(algo, settings) for algo in (base.algo, guided.algo)]
     spent = [0.0, 0.0]
     seconds.clear()
     for done in range(0, steps, CHUNK):
         for number, model in enumerate(models):
             begun = time.process_time()
             model.learn(CHUNK, reset_num_timesteps=done == 0)
-            spent[number] += (time.process_time() - begun) * (done > 0)  # what comes first is warming up
+            spent[number] += (time.process_time() - begun) * (done > 0)  # the first steps are random
     predictor: Any = models[1].predictor
     seconds["E's matrix products"] = int(predictor.n_updates) * products_of_a_batch(predictor)
     alone, with_e = (1000 * each / (steps - CHUNK) for each in spent)
@@ -117,7 +117,7 @@ def measure(pair: str, steps: int) -> dict[str, object]:
 
 
 def replace_section(path: Path, number: int, text: str) -> None:
-    """Writes one of the two tables of the page and leaves the other as it is."""
+    """Writes one of the two tables of the page and keeps the other."""
     page = path.read_text(encoding="utf-8") if path.is_file() else ""
     first, _, second = page.partition(f"{HEADINGS[1]}\n\n")
     sections = [first.removeprefix(f"{HEADINGS[0]}\n\n").strip(), second.strip()]
@@ -129,8 +129,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--pairs", nargs="+", default=PAIRS)
-    parser.add_argument("--bare", action="store_true", help=f"the constructors of {', '.join(BARE)} instead")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/step_cost.csv"))
+    parser.add_argument("--bare", action="store_true", help=f"the defaults of {', '.join(BARE)} instead")
+    parser.add_argument("--out", type=Path, default=Path("results/step_cost.csv"))
     options = parser.parse_args()
     if options.steps < 2 * CHUNK or options.steps % CHUNK:
         parser.error(f"--steps must be a multiple of {CHUNK}, from {2 * CHUNK} on, got {options.steps}.")

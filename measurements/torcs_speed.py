@@ -1,8 +1,8 @@
-"""Control steps per second of sap/TorcsLaneKeeping-v0 through the whole Gymnasium stack, and what bounds them.
+"""Measures control steps per second of sap/TorcsLaneKeeping-v0 through the whole Gymnasium stack, and of its physics.
 
-Processor time of one core.
+The rates are per second of processor time of one core.
 
-python benchmarks/bench_torcs.py [TRACK]
+python measurements/torcs_speed.py [TRACK]
 """
 
 import sys
@@ -20,7 +20,7 @@ TICKS = 100_000
 
 
 def main(track: str = "wheel-2") -> None:
-    """Drive with linear feedback, which stays on the road, and print the rates; then the physics alone."""
+    """Drives with linear feedback, which remains on the road, and prints the rates; then the physics alone."""
     gains = np.array([2.5 / 0.366519, -1.6, 0.0, 1.0, 0.0], dtype=np.float32)
     for control_step, steps in STEPS.items():
         env = gym.make("sap/TorcsLaneKeeping-v0", track=track, control_step=control_step, laps=None)

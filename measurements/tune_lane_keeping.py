@@ -1,10 +1,11 @@
-"""Tunes an algorithm's base settings on TORCS lane keeping; every algorithm gets this search and no other.
+"""Tunes a baseline on TORCS lane keeping; every algorithm gets this search and no other.
 
-Trains on Wheel-2 with seeds from 100 on, and scores the deterministic actor on validation tracks that are not among
-the four test tracks: mean S over 250, 500, 750 and 1,000 steps. The first two trials are the library's defaults and
-γ 0.9, learning rate 1e-3, net 128-256; the best three settings are run again on three fresh seeds, which decide.
+A trial trains on Wheel-2 with seed 100 and evaluates the deterministic actor on validation tracks that are not among the
+four test tracks: its value is the mean S after 250, 500, 750 and 1,000 steps. The first two trials are the library's
+defaults and γ 0.9, learning rate 1e-3, net 128-256. The best three settings are trained again on three fresh seeds,
+which decide.
 
-Usage: python benchmarks/tune_lane_keeping.py ALGO --out FOLDER [--trials 16]
+Usage: python measurements/tune_lane_keeping.py ALGO --out FOLDER [--trials 16]
 """
 
 import argparse
@@ -37,7 +38,7 @@ GOOD_GUESS = {"gamma": 0.9, "learning_rate": 1e-3, "net": "128-256"}
 
 
 def space(algo: str) -> dict[str, list]:
-    """The library's default of each setting comes first."""
+    """Values of each setting, the default of the library first."""
     settings: dict[str, list] = {
         "gamma": [0.99, 0.98, 0.95, 0.9, 0.8],
         "learning_rate": [1e-3, 3e-4, 5e-4, 2e-3] if algo != "sac" and algo != "tqc" else [3e-4, 5e-4, 1e-3, 2e-3],

@@ -1,7 +1,7 @@
 """Puts tables of results into the pages that show them: `python docs/tables.py` after results have changed.
 
-A page says where a table begins and ends: `<!-- table: results/X/returns.md -->` and `<!-- end -->`. The table `presets`
-is made from zoo_configs.
+A page says where a table begins and ends: `<!-- table: results/X/returns.md -->` and `<!-- end -->`. The table
+`presets` is made from zoo_configs.
 """
 
 import re

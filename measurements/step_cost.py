@@ -2,10 +2,10 @@
 
 The first table has the settings of presets; with ``--bare`` it has the defaults of the constructors, SB3's and ours.
 
-The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that other work on the
-machine affects both. Processor time is measured over the whole training but its first 50 steps, whose actions are
-random. The parts are measured inside the guided model. The matrix products of E are a lower bound of the cost of fitting
-it, which no other implementation of the same fit avoids.
+The two models of a pair train in turn, 50 steps at a time, on TORCS in one process and thread, so that other work on
+the machine affects both. Processor time is measured over the whole training but its first 50 steps, whose actions are
+random. The parts are measured inside the guided model. The matrix products of E are a lower bound of the cost of
+fitting it, which no other implementation of the same fit avoids.
 
 python measurements/step_cost.py [--pairs ddpg:fast 'td3:fast[teaching_growth=0]' …]   # writes .csv and .md
 python measurements/step_cost.py --bare   # writes a further .csv and the second table of the .md

@@ -1,9 +1,9 @@
 """Tunes a baseline on TORCS lane keeping; every algorithm gets this search and no other.
 
-A trial trains on Wheel-2 with seed 100 and evaluates the deterministic actor on validation tracks that are not among the
-four test tracks: its value is the mean S after 250, 500, 750 and 1,000 steps. The first two trials are the library's
-defaults and γ 0.9, learning rate 1e-3, net 128-256. The best three settings are trained again on three fresh seeds,
-which decide.
+A trial trains on Wheel-2 with seed 100 and evaluates the deterministic actor on validation tracks that are not among
+the four test tracks: its value is the mean S after 250, 500, 750 and 1,000 steps. The first two trials are the
+library's defaults and γ 0.9, learning rate 1e-3, net 128-256. The best three settings are trained again on three fresh
+seeds, which decide.
 
 Usage: python measurements/tune_lane_keeping.py ALGO --out FOLDER [--trials 16]
 """

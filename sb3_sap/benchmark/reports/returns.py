@@ -19,11 +19,11 @@ from sb3_sap.permissibility import FloatArray
 from sb3_sap.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
 
 NOTE = (
-    "The return of a run is the mean over its evaluation episodes, which have the same seeds in every run and are those "
-    "of the actor alone. Mean returns are interquartile means over runs with 95 % bootstrap intervals. *Permissible* is "
-    "the share of the actor's actions in the last evaluation that the AP function of the task permits: where a policy "
-    "has learned the task, a lower share shows how far the function is from being sound. Milliseconds per step are "
-    "processor time.\n"
+    "The return of a run is the mean over its evaluation episodes, which have the same seeds in every run and are "
+    "those of the actor alone. Mean returns are interquartile means over runs with 95 % bootstrap intervals. "
+    "*Permissible* is the share of the actor's actions in the last evaluation that the AP function of the task "
+    "permits: where a policy has learned the task, a lower share shows how far the function is from being sound. "
+    "Milliseconds per step are processor time.\n"
 )
 
 

@@ -24,11 +24,11 @@ from sb3_sap.statistics import interquartile_mean, probability_of_improvement
 
 NOTE = (
     "Laps and S are those of the actor alone on the test tracks after the whole training. S is the interquartile mean "
-    "over seeds and tracks with its 95 % stratified bootstrap interval; the worst seed has the lowest mean over tracks. "
-    "A run is *competent* from the first checkpoint at which it completes every test lap with S at or above the "
-    "threshold. Steps and seconds until then are medians over seeds, in which a run that never gets there counts as "
-    "infinite, and the number of seeds that do is in brackets. Times are processor times without evaluations: since a "
-    "run has one thread, a user waits as long on an idle machine. Seconds count from the start of the process, "
+    "over seeds and tracks with its 95 % stratified bootstrap interval; the worst seed has the lowest mean over "
+    "tracks. A run is *competent* from the first checkpoint at which it completes every test lap with S at or above "
+    "the threshold. Steps and seconds until then are medians over seeds, in which a run that never gets there counts "
+    "as infinite, and the number of seeds that do is in brackets. Times are processor times without evaluations: since "
+    "a run has one thread, a user waits as long on an idle machine. Seconds count from the start of the process, "
     "milliseconds from the first checkpoint. Episodes off the road are training episodes that end with the car off the "
     "road or facing backwards, as medians over seeds. The accuracy of E is balanced, on validation examples.\n"
 )

@@ -1,4 +1,4 @@
-"""Columns and cells: what is compared, and what is run for it."""
+"""Configurations, and the runs that are made of them."""
 
 import json
 import os
@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_sap.benchmark.cells import make_cell, make_grid, read_result, write_result
-from sb3_sap.benchmark.columns import GROUPS, Column, parse_column, parse_columns
+from sb3_sap.benchmark.configurations import Configuration, parse_configuration, parse_configurations
+from sb3_sap.benchmark.groups import GROUPS
 from sb3_sap.benchmark.learners import CLASSES, make_model, settings_of
 from sb3_sap.benchmark.linear import LinearFeedback
-from sb3_sap.benchmark.training import Recorder, how_ended, run_cell
+from sb3_sap.benchmark.recorder import Recorder, how_ended
+from sb3_sap.benchmark.runs import make_grid, make_run
+from sb3_sap.benchmark.training import train_and_evaluate
 from sb3_sap.envs.lane_keeping import STEERING_LOCK
 from sb3_sap.envs.torcs.installation import TorcsNotFoundError, find_installation
 
 
-def cell(text, steps=100, seed=0, tracks=("g-track-3",), simulator="highway"):
-    return make_cell(parse_column(text), simulator, steps, seed, tracks)
+def run(text, steps=100, seed=0, tracks=("g-track-3",), simulator="highway"):
+    return make_run(parse_configuration(text), simulator, steps, seed, tracks)
 
 
 @pytest.mark.parametrize(
@@ -42,17 +44,17 @@ def cell(text, steps=100, seed=0, tracks=("g-track-3",), simulator="highway"):
         ("linear", "linear", {}),
     ],
 )
-def test_columns_have_one_name(text, name, changes):
-    column = parse_column(text)
-    assert column.name == name
-    assert column.changes == changes
-    assert parse_column(name) == column
+def test_a_configuration_has_one_spelling(text, name, changes):
+    configuration = parse_configuration(text)
+    assert configuration.name == name
+    assert configuration.changes == changes
+    assert parse_configuration(name) == configuration
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("ddpg ap", "A column is written algo:preset"),
+        ("ddpg ap", "A configuration is written algo:preset"),
         ("ddpg:paper[alpha]", "'alpha' is not of the form key=value"),
         ("ddpg:paper[alpha=]", "is not of the form key=value"),
         ("ddpg:paper[a=[1]", "is not a value"),
@@ -63,92 +65,69 @@ def test_columns_have_one_name(text, name, changes):
         ("linear[angel=1]", "linear has no setting 'angel'"),
     ],
 )
-def test_wrong_columns_are_told_in_one_sentence(text, message):
+def test_a_wrong_configuration_is_reported_in_one_sentence(text, message):
     with pytest.raises(ValueError, match=r".") as error:
-        cell(text)
+        run(text)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_groups_expand_and_no_column_comes_twice():
-    columns = parse_columns(["paper", "ddpg:paper", "linear"])
-    assert [column.name for column in columns] == [*GROUPS["paper"], "linear"]
+def test_groups_expand_and_repeat_no_configuration():
+    configurations = parse_configurations(["paper", "ddpg:paper", "linear"])
+    assert [configuration.name for configuration in configurations] == [*GROUPS["paper"], "linear"]
 
 
 @pytest.mark.parametrize("name", [name for group in GROUPS if group not in ("sbx", "all") for name in GROUPS[group]])
-def test_every_column_has_settings(name):
-    cell(name)
+def test_every_configuration_of_a_group_has_settings(name):
+    run(name)
 
 
-def test_default_means_the_library_s_own():
+def test_default_means_the_library_s_own_settings():
     for algo in ("ddpg", "td3", "sac", "tqc", "crossq"):
-        assert settings_of(Column(algo), "torcs", 3_000) == {}
+        assert settings_of(Configuration(algo), "torcs", 3_000) == {}
 
 
-def test_overrides_go_into_the_settings_and_leave_the_rest():
-    paper = cell("ddpg_ap:paper", steps=3_000)
-    changed = cell("ddpg_ap:paper[predictor_kwargs.weight_decay=0,t_k=7,env.speed=80,env.random_start=true]", 3_000)
+def test_overrides_change_their_settings_and_no_others():
+    paper = run("ddpg_ap:paper", steps=3_000)
+    changed = run("ddpg_ap:paper[predictor_kwargs.weight_decay=0,t_k=7,env.speed=80,env.random_start=true]", 3_000)
     assert paper.settings["predictor_kwargs"]["weight_decay"] == 0.01
     assert changed.settings == paper.settings | {
         "predictor_kwargs": paper.settings["predictor_kwargs"] | {"weight_decay": 0},
         "t_k": 7,
     }
     assert changed.training == {"track": "wheel-2", "laps": None, "speed": 80, "random_start": True}
-    assert changed.task == {"speed": 80}  # laps are driven at that speed too, but from the line
+    assert changed.task == {"speed": 80}  # test laps are driven at that speed too, but not from random starts
 
 
-def test_sbx_gets_the_settings_of_its_namesake():
+def test_sbx_has_the_settings_of_its_namesake():
     pytest.importorskip("sbx")
-    assert settings_of(Column("sbx_sac", "default"), "torcs", 3_000) == {}
-    tuned = settings_of(Column("sac", "tuned"), "torcs", 3_000)
-    assert settings_of(Column("sbx_sac", "tuned"), "torcs", 3_000) == tuned | {
+    assert settings_of(Configuration("sbx_sac", "default"), "torcs", 3_000) == {}
+    tuned = settings_of(Configuration("sac", "tuned"), "torcs", 3_000)
+    assert settings_of(Configuration("sbx_sac", "tuned"), "torcs", 3_000) == tuned | {
         "qf_learning_rate": tuned["learning_rate"]
     }
-    paper = settings_of(Column("sbx_ddpg", "paper"), "torcs", 3_000)
+    paper = settings_of(Configuration("sbx_ddpg", "paper"), "torcs", 3_000)
     assert paper["learning_rate"] == 0.0001
     assert paper["qf_learning_rate"] == 0.001
 
 
 def test_checkpoints_end_with_the_training():
-    assert cell("ddpg", steps=300).checkpoints == [100, 150, 200, 250, 300]
-    assert cell("ddpg", steps=100).checkpoints == [100]
-    assert cell("linear", steps=600).checkpoints == [0]
+    assert run("ddpg", steps=300).checkpoints == [100, 150, 200, 250, 300]
+    assert run("ddpg", steps=100).checkpoints == [100]
+    assert run("linear", steps=600).checkpoints == [0]
 
 
-def test_a_grid_has_every_seed_and_the_linear_controller_once():
-    grid = make_grid(parse_columns(["ddpg", "linear"]), "highway", 100, range(100, 103))
-    assert {column.name: [cell.seed for cell in cells] for column, cells in grid.items()} == {
+def test_a_grid_has_every_seed_and_one_run_of_the_linear_controller():
+    grid = make_grid(parse_configurations(["ddpg", "linear"]), "highway", 100, range(100, 103))
+    assert {configuration.name: [run.seed for run in runs] for configuration, runs in grid.items()} == {
         "ddpg:default": [100, 101, 102],
         "linear": [0],
     }
 
 
-def test_a_parameter_added_since_leaves_results_valid_and_a_default_changed_since_does_not(tmp_path):
-    cell = make_cell(parse_column("ddpg_ap:default"), "torcs", 300, 0)
-    older = {name: value for name, value in cell.defaults.items() if name != "alpha_low"}
-    result = {"cell": cell.description() | {"defaults": older}}
-    write_result(cell, tmp_path, result)
-    assert read_result(cell, tmp_path) == result
-    write_result(cell, tmp_path, {"cell": cell.description() | {"defaults": older | {"alpha": 0.8}}})
-    assert read_result(cell, tmp_path) is None
-
-
-def test_a_result_is_found_by_its_whole_description(tmp_path):
-    here = cell("ddpg")
-    write_result(here, tmp_path, {"cell": here.description()})
-    assert read_result(here, tmp_path) == {"cell": here.description()}
-    for other in (cell("ddpg", seed=1), cell("ddpg", steps=101), cell("ddpg[gamma=0.9]"), cell("ddpg[env.speed=60]")):
-        assert read_result(other, tmp_path) is None
-    write_result(here, tmp_path, {"cell": here.description() | {"steps": 99}})
-    assert read_result(here, tmp_path) is None
-    here.path(tmp_path).write_text('{"cell": ')
-    with pytest.raises(ValueError, match="delete it"):
-        read_result(here, tmp_path)
-
-
-def test_seeds_of_a_column_share_the_name_of_their_files(tmp_path):
-    first, second = (cell("ddpg", seed=seed).path(tmp_path).name for seed in (0, 1))
-    assert first.removesuffix("-seed0.json") == second.removesuffix("-seed1.json")
+def test_names_of_runs_of_different_seeds_differ_in_the_seed_alone():
+    first, second = (run("ddpg", seed=seed).name for seed in (0, 1))
+    assert first.removesuffix("-seed0") == second.removesuffix("-seed1")
 
 
 def test_linear_feedback():
@@ -156,14 +135,14 @@ def test_linear_feedback():
     obs = np.array([[STEERING_LOCK / 10, 0, 0, 0, 0], [0, 0.5, 1, 0, 0], [0, -1, 1, 1, 0]], dtype=np.float32)
     assert policy.predict(obs)[0] == pytest.approx(np.array([[0.25], [-0.8], [1.0]]))
     assert policy.predict(obs[1])[0].shape == (1,)
-    laps = run_cell(cell("linear", tracks=["wheel-2"]), 0.0)["laps"]["data"]
+    laps = train_and_evaluate(run("linear", tracks=["wheel-2"]), 0.0)["laps"]["data"]
     assert [row[:3] for row in laps] == [[0, "wheel-2", True]]
     assert laps[0][5] > 0.98
 
 
 @pytest.fixture(scope="module")
 def result():
-    return run_cell(cell("ddpg_ap[min_per_class=2,dataset_size=32]", steps=300), 0.0)
+    return train_and_evaluate(run("ddpg_ap[min_per_class=2,dataset_size=32]", steps=300), 0.0)
 
 
 def test_one_run_yields_everything(result):
@@ -225,10 +204,10 @@ def test_a_run_is_the_same_however_often_it_is_evaluated(algo, simulator):
             pytest.skip(str(error))
     if algo.startswith("sbx"):
         pytest.importorskip("sbx")
-    often = cell(f"{algo}[learning_starts=30]", steps=150, simulator=simulator)
+    often = run(f"{algo}[learning_starts=30]", steps=150, simulator=simulator)
     often = replace(often, checkpoints=[30, 60, 90, 150])
     seldom = replace(often, checkpoints=[150])
-    first, second = run_cell(often, 0.0), run_cell(seldom, 0.0)
+    first, second = train_and_evaluate(often, 0.0), train_and_evaluate(seldom, 0.0)
     assert first["curve"] == second["curve"]
     assert first["episodes"] == second["episodes"]
     assert first["laps"]["data"][-len(second["laps"]["data"]) :] == second["laps"]["data"]

@@ -1,4 +1,4 @@
-"""The grid: nothing lost, nothing repeated, and a cell that fails hurts nobody else."""
+"""A grid loses no run and repeats none, and a run that fails affects no other."""
 
 import json
 import os
@@ -10,19 +10,20 @@ import time
 import pytest
 from rich.console import Console
 
-from sb3_sap.benchmark import process, runner
-from sb3_sap.benchmark.cells import make_grid, read_result
-from sb3_sap.benchmark.columns import parse_columns
+from sb3_sap.benchmark import dispatch, process
+from sb3_sap.benchmark.configurations import parse_configurations
+from sb3_sap.benchmark.runs import make_grid
+from sb3_sap.benchmark.store import read_result
 from sb3_sap.cli import main
 
 
-def grid(*columns, seeds=2, steps=50):
-    return make_grid(parse_columns(list(columns)), "highway", steps, range(seeds), ["g-track-3"])
+def grid(*configurations, seeds=2, steps=50):
+    return make_grid(parse_configurations(list(configurations)), "highway", steps, range(seeds), ["g-track-3"])
 
 
-def fake_result(cell):
-    laps = [[point, track, True, 1.0, 1.0, 0.9, 10] for point in cell.checkpoints for track in cell.tracks]
-    return {"cell": cell.description(), "laps": {"columns": [], "data": laps}}
+def fake_result(run):
+    laps = [[point, track, True, 1.0, 1.0, 0.9, 10] for point in run.checkpoints for track in run.tracks]
+    return {"run": run.description(), "laps": {"columns": [], "data": laps}}
 
 
 @pytest.fixture
@@ -30,36 +31,36 @@ def console():
     return Console(width=200, record=True, file=open(os.devnull, "w"))
 
 
-def run(cells, folder, console, monkeypatch, **options):
-    """Runs the grid with cells that do nothing and returns (number of failures, cells that ran)."""
-    ran = []
+def make(runs, folder, console, monkeypatch, **options):
+    """Makes a grid of runs that do nothing and returns the number of failures and the runs that were made."""
+    made = []
 
-    def fake(cell):
-        ran.append((cell.algo, cell.seed))
-        return {"error": "ValueError: no"} if cell.settings.get("gamma") == 0.5 else fake_result(cell)
+    def fake(run):
+        made.append((run.algo, run.seed))
+        return {"error": "ValueError: no"} if run.settings.get("gamma") == 0.5 else fake_result(run)
 
-    monkeypatch.setattr(runner, "run_in_own_process", fake)
-    return runner.run_grid(cells, folder, console, **options), ran
+    monkeypatch.setattr(dispatch, "run_in_own_process", fake)
+    return dispatch.run_grid(runs, folder, console, **options), made
 
 
-def test_only_what_is_missing_runs_seed_by_seed(tmp_path, console, monkeypatch):
-    assert run(grid("ddpg", "sac"), tmp_path, console, monkeypatch) == (
+def test_only_missing_runs_are_made_seed_by_seed(tmp_path, console, monkeypatch):
+    assert make(grid("ddpg", "sac"), tmp_path, console, monkeypatch) == (
         0,
         [("ddpg", 0), ("sac", 0), ("ddpg", 1), ("sac", 1)],
     )
-    assert run(grid("ddpg", "sac"), tmp_path, console, monkeypatch) == (0, [])
-    assert run(grid("sac", "td3", seeds=3), tmp_path, console, monkeypatch)[1] == [
+    assert make(grid("ddpg", "sac"), tmp_path, console, monkeypatch) == (0, [])
+    assert make(grid("sac", "td3", seeds=3), tmp_path, console, monkeypatch)[1] == [
         ("td3", 0),
         ("td3", 1),
         ("sac", 2),
         ("td3", 2),
     ]
-    assert "4 cells, 4 of them done already" in console.export_text()
-    assert len(list(tmp_path.iterdir())) == 8
+    assert "4 runs, 4 of which are done already" in console.export_text()
+    assert len(list((tmp_path / "runs").iterdir())) == 8
 
 
-def test_equal_cells_run_once(tmp_path, console, monkeypatch):
-    assert run(
+def test_equal_runs_are_made_once(tmp_path, console, monkeypatch):
+    assert make(
         grid("ddpg:default", "ddpg:paper[gamma=0.9]", "ddpg:paper", seeds=1), tmp_path, console, monkeypatch
     ) == (
         0,
@@ -67,30 +68,30 @@ def test_equal_cells_run_once(tmp_path, console, monkeypatch):
     )
 
 
-def test_a_failing_cell_is_told_and_the_rest_goes_on(tmp_path, console, monkeypatch):
-    failed, ran = run(grid("ddpg", "ddpg[gamma=0.5]", "sac"), tmp_path, console, monkeypatch, jobs=2)
+def test_a_failing_run_is_reported_and_the_others_continue(tmp_path, console, monkeypatch):
+    failed, made = make(grid("ddpg", "ddpg[gamma=0.5]", "sac"), tmp_path, console, monkeypatch, jobs=2)
     assert failed == 2
-    assert len(ran) == 6
+    assert len(made) == 6
     text = console.export_text()
     assert "failed ddpg:default[gamma=0.5], seed 1: ValueError: no" in text
-    assert "2 of 6 cells failed" in text
-    assert len(list(tmp_path.glob("*.json"))) == 4
+    assert "2 of 6 runs failed" in text
+    assert len(list((tmp_path / "runs").glob("*.json"))) == 4
 
 
 def test_exit_code_of_the_command(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "run_in_own_process", fake_result)
+    monkeypatch.setattr(dispatch, "run_in_own_process", fake_result)
     arguments = ["benchmark", "run", "--simulator", "highway", "--steps", "20", "--seeds", "1", "--out", str(tmp_path)]
-    assert main([*arguments, "--columns", "ddpg"]) == 0
-    assert len(list((tmp_path / "highway-20" / "cells").glob("ddpg-*-seed0.json"))) == 1
-    monkeypatch.setattr(runner, "run_in_own_process", lambda cell: {"error": "no"})
-    assert main([*arguments, "--columns", "sac"]) == 1
+    assert main([*arguments, "--configurations", "ddpg"]) == 0
+    assert len(list((tmp_path / "highway-20" / "runs").glob("ddpg-*-seed0.json"))) == 1
+    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run: {"error": "no"})
+    assert main([*arguments, "--configurations", "sac"]) == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--columns", "dpg:paper"], "did you mean 'ddpg'"),
-        (["--columns", "ddpg:paper[x]"], "not of the form key=value"),
+        (["--configurations", "dpg:paper"], "did you mean 'ddpg'"),
+        (["--configurations", "ddpg:paper[x]"], "not of the form key=value"),
         (["--backend", "dask"], "--backend dask needs --scheduler"),
         (["--backend", "dask", "--scheduler", "tcp://127.0.0.1:1"], "tcp://127.0.0.1:1"),
     ],
@@ -106,7 +107,7 @@ def test_errors_are_one_sentence(arguments, message, tmp_path, capsys):
 
 
 def test_a_missing_library_is_named(tmp_path, monkeypatch, capsys):
-    monkeypatch.delitem(sys.modules, "sb3_sap.benchmark.runner")
+    monkeypatch.delitem(sys.modules, "sb3_sap.benchmark.dispatch")
     monkeypatch.setitem(sys.modules, "joblib", None)
     assert main(["benchmark", "run", "--out", str(tmp_path)]) == 1
     assert "needs joblib: pip install 'sb3-sap[benchmark]'" in capsys.readouterr().err
@@ -130,7 +131,7 @@ def test_a_process_that_fails_or_dies_says_so():
 
 
 def command(out, *more):
-    fixed = ["--simulator", "highway", "--columns", "ddpg", "ddpg_ap", "--steps", "40", "--seeds", "2"]
+    fixed = ["--simulator", "highway", "--configurations", "ddpg", "ddpg_ap", "--steps", "40", "--seeds", "2"]
     fixed += ["--tracks", "g-track-3", "--out", str(out), *more]
     return [sys.executable, "-m", "sb3_sap.cli", "benchmark", "run", *fixed]
 
@@ -143,11 +144,11 @@ def wait_for(condition):
 
 
 def tables(folder):
-    """What the cells say, without the times."""
+    """The results of the runs without their times."""
     found = {}
     for path in folder.glob("*.json"):
         result = json.loads(path.read_text())
-        found[path.name] = {name: result[name] for name in ("cell", "laps", "curve", "episodes")}
+        found[path.name] = {name: result[name] for name in ("run", "laps", "curve", "episodes")}
     return found
 
 
@@ -157,25 +158,25 @@ def living_children(pid):
 
 @pytest.mark.slow
 def test_killed_and_started_again(tmp_path):
-    cells = tmp_path / "a" / "highway-40" / "cells"
+    runs = tmp_path / "a" / "highway-40" / "runs"
     killed = subprocess.Popen(command(tmp_path / "a"), stdout=subprocess.DEVNULL)
-    wait_for(lambda: len(list(cells.glob("*.json"))) >= 1)
+    wait_for(lambda: len(list(runs.glob("*.json"))) >= 1)
     wait_for(lambda: living_children(killed.pid))
     [child] = living_children(killed.pid)
     killed.kill()
     killed.wait()
-    before = {path: path.stat().st_mtime_ns for path in cells.glob("*.json")}
+    before = {path: path.stat().st_mtime_ns for path in runs.glob("*.json")}
     assert 1 <= len(before) < 4
-    wait_for(lambda: not os.path.exists(f"/proc/{child}"))  # the orphan ends by itself
+    wait_for(lambda: not os.path.exists(f"/proc/{child}"))  # the orphan exits by itself
     subprocess.run(command(tmp_path / "a"), check=True, stdout=subprocess.DEVNULL)
-    assert {path: path.stat().st_mtime_ns for path in before} == before  # no cell ran twice
+    assert {path: path.stat().st_mtime_ns for path in before} == before  # no run was made twice
     subprocess.run(command(tmp_path / "b", "--jobs", "2"), check=True, stdout=subprocess.DEVNULL)
-    assert len(tables(cells)) == 4
-    assert tables(cells) == tables(tmp_path / "b" / "highway-40" / "cells")
+    assert len(tables(runs)) == 4
+    assert tables(runs) == tables(tmp_path / "b" / "highway-40" / "runs")
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_the_cells_too(tmp_path):
+def test_ctrl_c_stops_the_runs_too(tmp_path):
     running = subprocess.Popen(
         command(tmp_path, "--steps", "100000"),
         stdout=subprocess.DEVNULL,
@@ -202,11 +203,11 @@ def test_a_cluster_gives_the_same_results(tmp_path):
     ) as cluster:
         remote = ["benchmark", "run", *command(tmp_path / "b")[5:]]
         assert main([*remote, "--backend", "dask", "--scheduler", cluster.scheduler_address]) == 0
-    assert len(tables(tmp_path / "b" / "highway-40" / "cells")) == 4
-    assert tables(tmp_path / "a" / "highway-40" / "cells") == tables(tmp_path / "b" / "highway-40" / "cells")
+    assert len(tables(tmp_path / "b" / "highway-40" / "runs")) == 4
+    assert tables(tmp_path / "a" / "highway-40" / "runs") == tables(tmp_path / "b" / "highway-40" / "runs")
 
 
 def test_every_result_can_be_read_back(tmp_path, console, monkeypatch):
-    cells = grid("ddpg")
-    run(cells, tmp_path, console, monkeypatch)
-    assert all(read_result(cell, tmp_path) == fake_result(cell) for column in cells.values() for cell in column)
+    runs = grid("ddpg")
+    make(runs, tmp_path, console, monkeypatch)
+    assert [read_result(run, tmp_path) == fake_result(run) for run in runs[next(iter(runs))]] == [True, True]

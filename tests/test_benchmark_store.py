@@ -202,7 +202,7 @@ def test_the_command_packs_every_grid(tmp_path, capsys):
         write_result(run(), tmp_path / name, result(run()))
     (tmp_path / "a_page.md").touch()
     assert main(["benchmark", "pack", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("packed 1 runs into") == 2
+    assert capsys.readouterr().out.count("holds 1 runs, 1 of which were packed now") == 2
     assert read_result(run(), tmp_path / "highway-200") == result(run())
     assert main(["benchmark", "pack", "--out", str(tmp_path)]) == 0
     assert "there are no runs to pack" in capsys.readouterr().out

@@ -94,7 +94,7 @@ def pack(options: argparse.Namespace, console: Console) -> int:
     folders = sorted({path.parent.parent for path in options.out.glob("*/runs/*.json")})
     for folder in folders:
         packed, total = store.pack(folder)
-        console.print(f"packed {packed} runs into {folder / store.ARCHIVE}, which holds {total}", soft_wrap=True)
+        console.print(f"{folder / store.ARCHIVE} holds {total} runs, {packed} of which were packed now", soft_wrap=True)
     if not folders:
         console.print(f"there are no runs to pack in {options.out}/", soft_wrap=True)
     return 0
@@ -154,13 +154,17 @@ def _grid(options: argparse.Namespace, steps: int, console: Console | None = Non
 
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     grid: dict[Configuration, list[Run]] = {}
+    left_out: dict[str, ValueError] = {}
     for configuration in parse_configurations(options.configurations):
         try:
             grid |= make_grid([configuration], options.simulator, steps, seeds, options.tracks)
         except ValueError as error:
             if console is None:
                 raise
-            console.print(f"{configuration.name} is left out: {error}", soft_wrap=True, markup=False)
+            left_out[configuration.name] = error
+    if console is not None and left_out:
+        reason = next(iter(left_out.values()))
+        console.print(f"{', '.join(left_out)} cannot be reported: {reason}", soft_wrap=True, markup=False)
     return grid
 
 

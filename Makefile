@@ -29,7 +29,7 @@ lowest:
 	$(PYTHON) -m venv --clear .venv-lowest
 	$(LOWEST)/$(PIP_INSTALL) -c constraints.txt uv
 	$(LOWEST)/$(PIP_INSTALL) $(TORCH_OPTIONS) $(LOWEST_TORCH)
-	$(LOWEST)/uv pip install -q --python .venv-lowest --resolution lowest-direct -e .[dev,peers]
+	$(LOWEST)/uv pip install -q --python .venv-lowest --resolution lowest-direct -e .[dev,sbx]
 	$(LOWEST)/python tests/lowest.py
 
 # The reference simulator, from Debian's packages, without root.
@@ -40,7 +40,7 @@ lint: .venv/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy --config-file= --ignore-missing-imports benchmarks
+	$(BIN)/mypy --config-file= --ignore-missing-imports measurements
 
 # The site, in docs/_build.
 docs: .venv/.installed

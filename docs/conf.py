@@ -1,6 +1,8 @@
 """Sphinx reads this: `make docs` builds the site into docs/_build."""
 
 import re
+import shutil
+from pathlib import Path
 
 import sb3_sap
 
@@ -12,7 +14,7 @@ release = version = sb3_sap.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build"]
-# The pages of results are written by commands and reached from docs/results/README.md.
+# The pages of results are reached from results/README.md.
 suppress_warnings = ["toc.not_included"]
 default_role = "code"  # single backticks in docstrings are code, as in Markdown
 
@@ -39,5 +41,22 @@ def escape(app, what, name, obj, options, lines) -> None:  # type: ignore[no-unt
     lines[:] = [re.sub(r"(?<=[ (])\*(?=\w+_shape)|\|", r"\\\g<0>", line) for line in lines]
 
 
+def copy_results(app) -> None:  # type: ignore[no-untyped-def]
+    """Copies results/ to docs/results/, because Sphinx reads pages of its own folder only."""
+    copy = Path(app.srcdir) / "results"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(copy.parent.parent / "results", copy, ignore=shutil.ignore_patterns("runs", "*.xz"))
+
+
+def follow_results(app, docname, source) -> None:  # type: ignore[no-untyped-def]
+    """Redirects links between docs/ and results/, which lie side by side in the repository, to the copy."""
+    if docname.startswith("results/"):
+        source[0] = re.sub(r"(\]\((?:\.\./)+)docs/", r"\1", source[0])
+    else:
+        source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./results/", r"\1results/", source[0])
+
+
 def setup(app) -> None:  # type: ignore[no-untyped-def]
     app.connect("autodoc-process-docstring", escape)
+    app.connect("builder-inited", copy_results)
+    app.connect("source-read", follow_results)

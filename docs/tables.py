@@ -19,7 +19,7 @@ from sb3_sap.presets import algorithms, preset_names
 
 ROOT = Path(__file__).parent.parent
 #: Where the pages of results are: the only place that says so to the markers.
-RESULTS = ROOT / "docs" / "results"
+RESULTS = ROOT / "results"
 PAGES = [
     ROOT / "README.md",
     *(page for folder in ("docs", "docs/algorithms") for page in sorted((ROOT / folder).glob("*.md"))),

@@ -79,8 +79,8 @@ def commands():
         ["train", *lane, "-P", "--eval-freq", "100", "--eval-episodes", "1"],
         ["plot", "train", "-a", "ddpg_ap", "-e", LANE, "-f", "logs", "-w", "1", "--save-figures", "figures"],
         ["optimize", *lane, *study, "--guidance-only", "--eval-episodes", "1"],
-        ["benchmark", "run", *grid, "--columns", "ddpg_ap:fast", "sbx_sac:default"],
-        ["benchmark", "summary", *grid, "--columns", "ddpg_ap:fast", "sbx_sac:default"],
+        ["benchmark", "run", *grid, "--configurations", "ddpg_ap:fast", "sbx_sac:default"],
+        ["benchmark", "summary", *grid, "--configurations", "ddpg_ap:fast", "sbx_sac:default"],
     ):
         assert main(line) == 0, line
 
@@ -94,7 +94,7 @@ def cluster():
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as local:
         workers = ["--backend", "dask", "--scheduler", local.scheduler_address]
         grid = ["--simulator", "highway", "--steps", "50", "--seeds", "1", "--tracks", "g-track-3", "--out", "cluster"]
-        assert main(["benchmark", "run", *grid, "--columns", "ddpg", *workers]) == 0
+        assert main(["benchmark", "run", *grid, "--configurations", "ddpg", *workers]) == 0
 
 
 def tools():

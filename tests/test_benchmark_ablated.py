@@ -1,4 +1,4 @@
-"""The ablations differ from DDPG-AP in one thing each."""
+"""Each ablated variant differs from DDPG-AP in one thing."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,23 +1,25 @@
-"""Tables, figures and claims from synthetic cells, whose figures can be computed in the head."""
+"""Tables, figures and claims of synthetic runs, whose values can be computed in the head."""
 
 import math
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
 
-from sb3_sap.benchmark.cells import make_grid, write_result
-from sb3_sap.benchmark.claims import CLAIMS, claims, judged
-from sb3_sap.benchmark.columns import parse_columns
-from sb3_sap.benchmark.drawing import curve_figure
-from sb3_sap.benchmark.figures import with_averages
-from sb3_sap.benchmark.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
+from sb3_sap.benchmark.configurations import parse_configurations
 from sb3_sap.benchmark.paper import TEST_TRACKS
-from sb3_sap.benchmark.results import collect
-from sb3_sap.benchmark.summary import improvement
-from sb3_sap.benchmark.tables import curve_table
-from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, LAP_COLUMNS, TIME_COLUMNS
+from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
+from sb3_sap.benchmark.reports.claims import CLAIMS, claims, judged
+from sb3_sap.benchmark.reports.drawing import curve_figure
+from sb3_sap.benchmark.reports.figures import with_averages
+from sb3_sap.benchmark.reports.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
+from sb3_sap.benchmark.reports.results import collect
+from sb3_sap.benchmark.reports.summary import improvement
+from sb3_sap.benchmark.reports.tables import curve_table
+from sb3_sap.benchmark.runs import make_grid
+from sb3_sap.benchmark.store import write_result
+from sb3_sap.benchmark.training import LAP_COLUMNS
 from sb3_sap.cli.main import main
 from sb3_sap.evaluation.statistics import probability_of_improvement
 
@@ -26,40 +28,40 @@ MADE = {"versions": {"python": "3.11"}, "machine": "a machine", "date": "2020-01
 SCORES = {"ddpg": (0.1, 0.2), "ddpg_ap": (0.91, 0.96), "ddpg_ap_ce2": (0.2, 0.93), "ddpg_ce1": (0.5, 0.5)}
 
 
-def synthetic(cell, accuracy=0.8):
-    """The result of a cell: S by algorithm and checkpoint, plus 0.002 for each seed; ten steps an episode."""
-    early, late = SCORES.get(cell.algo, (0.9, 0.9))
+def synthetic(run, accuracy=0.8):
+    """The result of a run: S by algorithm and checkpoint, plus 0.002 for each seed; ten steps an episode."""
+    early, late = SCORES.get(run.algo, (0.9, 0.9))
     laps, times = [], []
-    for point in cell.checkpoints:
-        score = (0 if 0 < point < 250 else early if point < 500 else late) + cell.seed / 500
-        laps += [[point, track, score > 0.4, min(score * 2, 1), 1000 * score, score, 10] for track in cell.tracks]
+    for point in run.checkpoints:
+        score = (0 if 0 < point < 250 else early if point < 500 else late) + run.seed / 500
+        laps += [[point, track, score > 0.4, min(score * 2, 1), 1000 * score, score, 10] for track in run.tracks]
         times.append([point, 4 + point / 50, point / 50, point / 100])  # on a machine that is busy with something else
-    guided = "_ap" in cell.algo
-    steps = range(25, cell.steps + 1, 25)
-    low = 300 if guided else cell.steps  # the step until which the moving average is low
+    guided = "_ap" in run.algo
+    steps = range(25, run.steps + 1, 25)
+    low = 300 if guided else run.steps  # the step until which the moving average is low
     e = (accuracy, accuracy - 0.05) if guided else (None, None)
     curve = [[step, 10.0 if step <= low else 45.0, *e] for step in steps]
     lost = 10 if guided else 130
     episodes = [[10 * (i + 1), 10, -200.0, "off track"] for i in range(lost)]
-    episodes.append([cell.steps, cell.steps - 10 * lost, 40.0 * (cell.steps - 10 * lost), "unfinished"])
-    if cell.algo == "linear":
+    episodes.append([run.steps, run.steps - 10 * lost, 40.0 * (run.steps - 10 * lost), "unfinished"])
+    if run.algo == "linear":
         times, curve, episodes = [], [], []
     tables = {"laps": (LAP_COLUMNS, laps), "times": (TIME_COLUMNS, times), "curve": (CURVE_COLUMNS, curve)}
     tables["episodes"] = (EPISODE_COLUMNS, episodes)
     tables = {name: {"columns": columns, "data": data} for name, (columns, data) in tables.items()}
-    return {"cell": cell.description(), "made": MADE, **tables}
+    return {"run": run.description(), "made": MADE, **tables}
 
 
-def make(folder, columns=("paper",), steps=3_000, seeds=2, simulator="highway", **changes):
-    grid = make_grid(parse_columns(list(columns)), simulator, steps, range(seeds))
-    cells = folder / f"{simulator}-{steps}" / "cells"
-    for of_column in grid.values():
-        for cell in of_column:
-            write_result(cell, cells, synthetic(cell, **changes))
-    return collect(grid, cells, simulator, steps)
+def make(folder, configurations=("paper",), steps=3_000, seeds=2, simulator="highway", **changes):
+    grid = make_grid(parse_configurations(list(configurations)), simulator, steps, range(seeds))
+    folder = folder / f"{simulator}-{steps}"
+    for runs in grid.values():
+        for run in runs:
+            write_result(run, folder, synthetic(run, **changes))
+    return collect(grid, folder, simulator, steps)
 
 
-def test_competence(tmp_path):
+def test_competence_is_the_first_checkpoint_with_every_lap_above_the_threshold(tmp_path):
     results = make(tmp_path)
     at_90, at_95 = (steps_to_competence(results.laps, threshold) for threshold in (0.9, 0.95))
     assert at_90["ddpg_ap:paper"].tolist() == [250, 250]
@@ -76,7 +78,7 @@ def test_a_lap_that_is_not_done_is_not_competent(tmp_path):
     assert steps_to_competence(laps, 0.9).tolist() == [350]
 
 
-def test_median_counts_those_that_never_get_there():
+def test_the_median_counts_a_run_that_never_gets_there_as_infinite():
     assert median_reached(pd.Series([250, 500, math.inf])) == (500, 2)
     assert median_reached(pd.Series([250, math.inf, math.inf])) == (math.inf, 1)
 
@@ -109,39 +111,39 @@ def test_probability_of_improvement():
     assert 0.5 <= low < p < high <= 1
 
 
-def test_guided_columns_are_compared_with_their_base_and_the_best_peer(tmp_path):
+def test_a_guided_configuration_is_compared_with_its_base_and_the_best_baseline(tmp_path):
     results = make(tmp_path, ["paper", "ddpg", "sac:tuned"])
     table = improvement(results)
     found = {(row.guided, row.against): row.probability for row in table.itertuples()}
     assert found == {
         ("ddpg_ap:paper", "ddpg:paper"): 1,
-        ("ddpg_ap:paper", "sac:tuned (best peer)"): 1,
+        ("ddpg_ap:paper", "sac:tuned (best baseline)"): 1,
         ("ddpg_ap_ce2:paper", "ddpg:paper"): 1,
-        ("ddpg_ap_ce2:paper", "sac:tuned (best peer)"): 1,
+        ("ddpg_ap_ce2:paper", "sac:tuned (best baseline)"): 1,
     }
 
 
-def test_a_harder_condition_is_compared_within_itself(tmp_path):
-    harder = ["ddpg_ap:fast[env.speed=80]", "ddpg:tuned[env.speed=80]"]
-    make(tmp_path, [*harder, "ddpg:tuned", "sac:tuned[env.random_start=true]"])
-    assert report(tmp_path, "--columns", *harder, "ddpg:tuned", name="harder") == 0
-    table = pd.read_csv(tmp_path / "highway-3000" / "harder_improvement.csv")
-    assert table[["guided", "against"]].to_numpy().tolist() == [[harder[0], f"{harder[1]} (best peer)"]]
+def test_a_robustness_test_compares_within_its_condition(tmp_path):
+    fast = ["ddpg_ap:fast[env.speed=80]", "ddpg:tuned[env.speed=80]"]
+    make(tmp_path, [*fast, "ddpg:tuned", "sac:tuned[env.random_start=true]"])
+    assert report(tmp_path, "--configurations", *fast, "ddpg:tuned", name="robustness") == 0
+    table = pd.read_csv(tmp_path / "highway-3000" / "robustness_improvement.csv")
+    assert table[["guided", "against"]].to_numpy().tolist() == [[fast[0], f"{fast[1]} (best baseline)"]]
 
 
-def test_a_changed_guided_column_is_compared_with_itself_unchanged(tmp_path):
+def test_a_changed_guided_configuration_is_compared_with_itself_unchanged(tmp_path):
     changed = "td3_ap:fast[teaching_growth=0]"
     table = improvement(make(tmp_path, [changed, "td3_ap:fast", "ddpg_ap:fast", "td3:tuned"]))
     found = table[["guided", "against"]].to_numpy().tolist()
-    assert found[:2] == [[changed, "td3_ap:fast"], [changed, "td3:tuned (best peer)"]]
+    assert found[:2] == [[changed, "td3_ap:fast"], [changed, "td3:tuned (best baseline)"]]
     assert [row for row in found if row[1] == "td3_ap:fast"] == found[:1]
 
 
 def test_the_headline_is_a_table_of_s_and_laps(tmp_path):
     make(tmp_path, ["ddpg_ap:paper", "ddpg:paper", "linear"])
-    assert report(tmp_path, "--columns", "ddpg_ap:paper", "ddpg:paper", "linear", name="headline") == 0
+    assert report(tmp_path, "--configurations", "ddpg_ap:paper", "ddpg:paper", "linear", name="headline") == 0
     header, _, ap, ddpg, linear = (tmp_path / "highway-3000" / "headline.md").read_text().splitlines()
-    assert header.startswith("| column | S after 250 steps (laps) | S after 500 steps (laps) |")
+    assert header.startswith("| configuration | S after 250 steps (laps) | S after 500 steps (laps) |")
     assert ap.split(" | ")[:3] == ["| ddpg_ap:paper", "0.911 [0.910, 0.912] (8 of 8)", "0.961 [0.960, 0.962] (8 of 8)"]
     assert "(0 of 8)" in ddpg
     assert linear.count("0.900 (4 of 4)") == 4
@@ -161,13 +163,13 @@ def test_all_reports_of_the_runs_that_there_are(tmp_path, capsys):
     assert report(tmp_path) == 0
     folder = tmp_path / "highway-3000"
     figures = ("figure4a", "figure4b", "figure5", "curve")
-    curves = {f"{name}.{kind}" for name in figures for kind in ("png", "svg", "csv")}
+    curves = {f"{name}.{kind}" for name in figures for kind in ("svg", "csv")}
     pages = {f"{name}.md" for name in ("table2", "figure4", "figure5", "curve", "summary")}
     assert files(folder) == curves | pages | {"headline.md", "table2.csv", "summary.csv", "summary_improvement.csv"}
     assert "ablations is left out" in capsys.readouterr().out
     for name in figures:
-        with Image.open(folder / f"{name}.png") as image:
-            assert len(image.convert("RGB").getcolors(1 << 24)) > 10
+        drawing = ElementTree.parse(folder / f"{name}.svg")
+        assert len(drawing.findall(".//{http://www.w3.org/2000/svg}path")) > 10
 
     assert "| not run |" in (tmp_path / "highway-claims.md").read_text()
     table = (folder / "table2.md").read_text()
@@ -196,9 +198,9 @@ def test_the_same_runs_give_the_same_bytes(tmp_path):
     assert found[0] == found[1]
 
 
-def test_the_curve_shows_each_column_beside_what_it_is_compared_with(tmp_path):
+def test_the_curve_has_a_panel_for_each_family_of_configurations(tmp_path):
     results = make(tmp_path, ["ddpg:paper", "ddpg_ap:paper", "ddpg_ap:fast", "td3:tuned", "ddpg:default", "linear"])
-    axes = curve_figure(curve_table(results), results.columns).axes
+    axes = curve_figure(curve_table(results), results.configurations).axes
     panels = [[text.get_text() for text in left.get_legend().get_texts()] for left in axes[::2]]
     assert panels == [
         ["ddpg:paper", "ddpg_ap:paper", "linear"],
@@ -207,23 +209,23 @@ def test_the_curve_shows_each_column_beside_what_it_is_compared_with(tmp_path):
     ]
 
 
-def test_what_does_not_learn_has_no_curve(tmp_path, capsys):
+def test_a_controller_has_no_curve(tmp_path, capsys):
     make(tmp_path, ["linear"])
     assert report(tmp_path) == 0
-    assert "curve is left out: none of these columns learns" in capsys.readouterr().out
+    assert "curve is left out: none of these configurations learns" in capsys.readouterr().out
     assert (tmp_path / "highway-3000" / "headline.md").is_file()
 
 
-def test_nothing_to_report(tmp_path, capsys):
+def test_without_results_the_report_fails(tmp_path, capsys):
     assert report(tmp_path) == 1
-    assert "table2 is left out: there are no results of these columns" in capsys.readouterr().out
+    assert "table2 is left out: there are no results of these configurations" in capsys.readouterr().out
 
 
 def test_results_of_other_settings_are_not_taken(tmp_path):
     make(tmp_path, ["ddpg_ap:paper[alpha=0.5]"])
-    grid = make_grid(parse_columns(["ddpg_ap:paper"]), "highway", 3_000, range(2))
-    with pytest.raises(ValueError, match="no results of these columns"):
-        collect(grid, tmp_path / "highway-3000" / "cells", "highway", 3_000)
+    grid = make_grid(parse_configurations(["ddpg_ap:paper"]), "highway", 3_000, range(2))
+    with pytest.raises(ValueError, match="no results of these configurations"):
+        collect(grid, tmp_path / "highway-3000", "highway", 3_000)
 
 
 def verdicts(folder, **changes):
@@ -231,7 +233,7 @@ def verdicts(folder, **changes):
     return {row["the paper says"]: (row["ours"], row["verdict"]) for _, row in table.iterrows()}
 
 
-def test_claims(tmp_path):
+def test_claims_are_judged_by_their_criteria(tmp_path):
     found = verdicts(tmp_path)
     good, bad = "**reproduced**", "not reproduced"
     stable = "Fig. 4a: it gets stable more quickly, around 2,500 steps."
@@ -268,7 +270,7 @@ def test_claims_of_a_worse_predictor(tmp_path):
     assert found["Fig. 5: it is 80 % on average."] == ("72.0%", "not reproduced")
 
 
-def test_claims_page_says_what_was_not_run(tmp_path):
+def test_the_page_of_claims_says_what_was_not_run(tmp_path):
     claims({3_000: make(tmp_path, seeds=1)}, tmp_path / "claims.md", "sb3-sap benchmark claims")
     page = (tmp_path / "claims.md").read_text()
     assert page.count("| not run |") == sum(claim.steps == 15_000 for claim in CLAIMS)

@@ -1,17 +1,20 @@
-"""Tasks beyond lane keeping in the benchmark's grid."""
+"""Tasks beyond lane keeping in the benchmark."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
 
-from sb3_sap.benchmark import runner
-from sb3_sap.benchmark.cells import make_cell, make_grid, write_result
-from sb3_sap.benchmark.columns import parse_column, parse_columns
-from sb3_sap.benchmark.results import collect
-from sb3_sap.benchmark.returns import mean_returns, steps_to_return
-from sb3_sap.benchmark.tasks import EPISODES, RETURN_COLUMNS, evaluation, evaluations, task_columns
-from sb3_sap.benchmark.training import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS, run_cell
+from sb3_sap.benchmark import dispatch
+from sb3_sap.benchmark.configurations import parse_configuration, parse_configurations
+from sb3_sap.benchmark.episodes import RETURN_COLUMNS, evaluation
+from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
+from sb3_sap.benchmark.reports.results import collect
+from sb3_sap.benchmark.reports.returns import mean_returns, steps_to_return
+from sb3_sap.benchmark.runs import make_grid, make_run
+from sb3_sap.benchmark.store import write_result
+from sb3_sap.benchmark.task_settings import EPISODES, evaluations, task_configurations
+from sb3_sap.benchmark.training import train_and_evaluate
 from sb3_sap.cli.main import main
 from sb3_sap.presets import load_config
 
@@ -19,12 +22,12 @@ CAR = "MountainCarContinuous-v0"
 MADE = {"versions": {"python": "3.11"}, "machine": "a machine", "date": "2020-01-02", "revision": "abc"}
 
 
-def cell(text, env_id=CAR, steps=100, seed=0, episodes=EPISODES):
-    return make_cell(parse_column(text), env_id, steps, seed, episodes)
+def run(text, env_id=CAR, steps=100, seed=0, episodes=EPISODES):
+    return make_run(parse_configuration(text), env_id, steps, seed, episodes)
 
 
 class Policy:
-    """Does what a function of the batch of observations says."""
+    """Acts by a function of the batch of observations."""
 
     def __init__(self, act):
         self.act = act
@@ -39,14 +42,14 @@ def rows_of(act, env_id=CAR, algo="ddpg_ap", episodes=("10000", "10001")):
     return [dict(zip(RETURN_COLUMNS[1:], row, strict=True)) for row in rows]
 
 
-# ------------------------------------------------------------------ columns and cells
+# ------------------------------------------------------------------ configurations and runs
 
 
-def test_a_guided_column_its_base_and_the_peer():
-    assert task_columns(CAR) == ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=200000,seeds=3]", "rule"]
-    assert "rule" not in task_columns("sap/TorcsDriving-v0")  # the environment itself labels
+def test_a_task_compares_a_guided_algorithm_with_its_base_tuned_settings_and_the_oracle():
+    assert task_configurations(CAR) == ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=200000,seeds=3]", "oracle"]
+    assert "oracle" not in task_configurations("sap/TorcsDriving-v0")  # the environment itself labels
     guided, base, tuned, default = (
-        cell(text) for text in ("ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=300]", "ddpg")
+        run(text) for text in ("ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=300]", "ddpg")
     )
     assert guided.settings["ap_function"] == "sb3_sap.tasks.mountain_car_continuous"
     shared = ("policy_kwargs", "learning_rate")
@@ -57,15 +60,17 @@ def test_a_guided_column_its_base_and_the_peer():
     assert guided.tracks == [str(seed) for seed in range(10_000, 10_010)]
 
 
-def test_every_column_of_a_task_trains_in_the_same_environment():
-    options = {str(cell(text, "highway-fast-v0").training) for text in ("sac_ap:task", "sac:task", "sac")}
+def test_every_configuration_of_a_task_trains_in_the_same_environment():
+    options = {str(run(text, "highway-fast-v0").training) for text in ("sac_ap:task", "sac:task", "sac")}
     assert len(options) == 1
     assert "Kinematics" in options.pop()
 
 
-def test_a_column_may_have_fewer_seeds():
-    grid = make_grid(parse_columns(["ddpg_ap:task", "ddpg:tuned[steps=40,seeds=2]"]), CAR, 20, range(5), EPISODES)
-    assert [len(cells) for cells in grid.values()] == [5, 2]
+def test_a_configuration_may_have_fewer_seeds():
+    grid = make_grid(
+        parse_configurations(["ddpg_ap:task", "ddpg:tuned[steps=40,seeds=2]"]), CAR, 20, range(5), EPISODES
+    )
+    assert [len(runs) for runs in grid.values()] == [5, 2]
 
 
 @pytest.mark.parametrize(
@@ -76,15 +81,19 @@ def test_a_column_may_have_fewer_seeds():
         ("ddpg:paper", CAR, "ddpg has no preset 'paper'"),
         ("ddpg:task[steps=0]", CAR, "steps must be 1 or more, but is 0"),
         ("ddpg:task[alpha=1]", CAR, "ddpg has no setting 'alpha'"),
-        ("linear", CAR, f"The column linear is for lane keeping, but {CAR} is not"),
-        ("rule", "sap/TorcsDriving-v0", "a task whose entry in zoo_configs names an AP function, but sap/TorcsDriving"),
-        ("rule", "highway", "names an AP function, but highway is not"),
-        ("rule[alpha=1]", CAR, "rule has no setting 'alpha'"),
+        ("linear", CAR, f"The configuration linear is for lane keeping, but {CAR} is not"),
+        (
+            "oracle",
+            "sap/TorcsDriving-v0",
+            "a task whose entry in zoo_configs names an AP function, but sap/TorcsDriving",
+        ),
+        ("oracle", "highway", "names an AP function, but highway is not"),
+        ("oracle[alpha=1]", CAR, "oracle has no setting 'alpha'"),
     ],
 )
-def test_wrong_columns_are_told_in_one_sentence(text, env_id, message):
+def test_a_wrong_configuration_is_reported_in_one_sentence(text, env_id, message):
     with pytest.raises(ValueError, match=r".") as error:
-        make_grid([parse_column(text)], env_id, 20, [0], EPISODES)
+        make_grid([parse_configuration(text)], env_id, 20, [0], EPISODES)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -143,7 +152,7 @@ def test_episodes_run_side_by_side_as_they_would_alone():
     assert together == [row for seed in episodes for row in rows_of(act, episodes=(seed,))]
 
 
-def test_discrete_actions_and_goals():
+def test_evaluation_of_discrete_actions_and_goals():
     [row] = rows_of(lambda obs: np.where(obs[:, 1] >= 0, 2, 0), "MountainCar-v0", "dqn", ("10000",))
     assert row["total_reward"] == -row["steps"] > -200
     [row] = rows_of(lambda obs: np.zeros((len(obs["observation"]), 2)), "parking-v0", "tqc", ("10000",))
@@ -152,29 +161,31 @@ def test_discrete_actions_and_goals():
 
 
 def test_one_run_yields_everything():
-    result = run_cell(cell("ddpg_ap:task[learning_starts=20,min_per_class=2]", steps=40, episodes=["10000"]), 0.0)
+    result = train_and_evaluate(
+        run("ddpg_ap:task[learning_starts=20,min_per_class=2]", steps=40, episodes=["10000"]), 0.0
+    )
     assert result["laps"]["columns"] == RETURN_COLUMNS
     assert [row[:2] for row in result["laps"]["data"]] == [[point, "10000"] for point in range(2, 41, 2)]
     assert result["curve"]["data"][0][:2] == [25, pytest.approx(result["curve"]["data"][0][1])]
     assert result["episodes"]["data"] == [[40, 40, result["episodes"]["data"][0][2], "unfinished"]]
 
 
-# ------------------------------------------------------------------ the AP function by itself
+# ------------------------------------------------------------------ the look-ahead oracle
 
 
-def told_by_the_rule(text, env_id, episodes=("10000", "10001"), seed=0):
-    of = cell(text, env_id, seed=seed, episodes=episodes)
+def rows_of_the_oracle(text, env_id, episodes=("10000", "10001"), seed=0):
+    of = run(text, env_id, seed=seed, episodes=episodes)
     assert (of.steps, of.checkpoints) == (0, [0])
-    result = run_cell(of, 0.0)
+    result = train_and_evaluate(of, 0.0)
     assert result["curve"]["data"] == result["times"]["data"] == []
     return [dict(zip(RETURN_COLUMNS, row, strict=True)) for row in result["laps"]["data"]]
 
 
-def test_the_rule_takes_permissible_actions_alone():
-    rows = told_by_the_rule("rule", CAR)
+def test_the_oracle_executes_only_permissible_actions():
+    rows = rows_of_the_oracle("oracle", CAR)
     assert [row["permissible"] for row in rows] == [1.0, 1.0]
     assert all(row["total_reward"] > 90 for row in rows)  # to pump energy is to solve it
-    assert rows == told_by_the_rule("rule", CAR) != told_by_the_rule("rule", CAR, seed=1)
+    assert rows == rows_of_the_oracle("oracle", CAR) != rows_of_the_oracle("oracle", CAR, seed=1)
 
 
 def idle(obs, actions, next_obs):
@@ -186,20 +197,20 @@ def never(obs, actions, next_obs):
     return np.zeros(len(actions), dtype=bool)
 
 
-def test_the_rule_tries_out_what_an_action_does_in_a_copy():
-    [row] = told_by_the_rule(f"rule[ap_function={__name__}.idle]", "Acrobot-v1", ("10000",))
+def test_the_oracle_tries_actions_in_a_copy():
+    [row] = rows_of_the_oracle(f"oracle[ap_function={__name__}.idle]", "Acrobot-v1", ("10000",))
     assert (row["permissible"], row["total_reward"]) == (1.0, -500.0)  # hanging as it was
-    [row] = told_by_the_rule(f"rule[ap_function={__name__}.never]", "Acrobot-v1", ("10000",))
+    [row] = rows_of_the_oracle(f"oracle[ap_function={__name__}.never]", "Acrobot-v1", ("10000",))
     assert row["permissible"] == 0.0
-    assert row["steps"] > 100  # nothing is permissible: it goes on at random
-    rows = told_by_the_rule("rule", "parking-v0", ("10000",))  # a goal, two actions
+    assert row["steps"] > 100  # nothing is permissible: it acts at random
+    rows = rows_of_the_oracle("oracle", "parking-v0", ("10000",))  # a goal, two actions
     assert [row["success"] for row in rows] == [False]
 
 
 # ------------------------------------------------------------------ report
 
-#: Mean return at half of the training and at its end, by column.
-RETURNS = {"ddpg_ap:task": (91, 95), "ddpg:task": (0, 0), "ddpg:tuned": (-20, 93), "rule": (0, 50)}
+#: Mean return at half of the training and at its end, by configuration.
+RETURNS = {"ddpg_ap:task": (91, 95), "ddpg:task": (0, 0), "ddpg:tuned": (-20, 93), "oracle": (0, 50)}
 
 
 def synthetic(of, name):
@@ -214,39 +225,38 @@ def synthetic(of, name):
         "curve": (CURVE_COLUMNS, [[25, 1.0, 0.8, 0.7]] if of.steps else []),
         "episodes": (EPISODE_COLUMNS, [[of.steps, of.steps, 1.0, "unfinished"]] if of.steps else []),
     }
-    return {"cell": of.description(), "made": MADE} | {
+    return {"run": of.description(), "made": MADE} | {
         table: {"columns": columns, "data": rows} for table, (columns, rows) in tables.items()
     }
 
 
 def test_the_command_writes_a_page(tmp_path, monkeypatch, capsys):
-    columns = ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=100,seeds=1]", "rule"]
-    grid = make_grid(parse_columns(columns), CAR, 40, range(2), EPISODES)
+    configurations = ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=100,seeds=1]", "oracle"]
+    grid = make_grid(parse_configurations(configurations), CAR, 40, range(2), EPISODES)
     folder = tmp_path / CAR
-    for column, cells in grid.items():
-        for of in cells:
-            write_result(of, folder / "cells", synthetic(of, column.name))
-    monkeypatch.setattr(runner, "run_in_own_process", lambda cell: {"error": "nothing is missing"})
+    for configuration, runs in grid.items():
+        for of in runs:
+            write_result(of, folder, synthetic(of, configuration.name))
+    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run: {"error": "nothing is missing"})
     command = ["benchmark", "task", CAR, "--steps", "40", "--seeds", "2", "--out", str(tmp_path)]
-    assert main([*command, "--columns", *columns]) == 0
+    assert main([*command, "--configurations", *configurations]) == 0
     page = (folder / "returns.md").read_text(encoding="utf-8")
     assert "| ddpg_ap:task | 40 | 2 | 95.5 [95, 96] | 95 | 2 (2 of 2) | 90.0% | 0.800 | 50.0 |" in page
     assert "| ddpg:task | 40 | 2 | 0.5 [0, 1] | 0 | – (0 of 2) |" in page
     assert "| ddpg:tuned[steps=100,seeds=1] | 100 | 1 | 93 [93, 93] | 93 | 100 (1 of 1) |" in page
-    assert "| rule | 0 | 2 | 50.5 [50, 51] | 50 | – (0 of 2) | 90.0% |  |  |" in page
+    assert "| oracle | 0 | 2 | 50.5 [50, 51] | 50 | – (0 of 2) | 90.0% |  |  |" in page
     assert "| ddpg_ap:task | ddpg:task | 1.00 [1.00, 1.00] |" in page
-    assert "| ddpg_ap:task | rule | 1.00 [1.00, 1.00] |" in page
-    assert f"Made by `sb3-sap benchmark task {CAR} --steps 40 --seeds 2 --columns" in page
+    assert "| ddpg_ap:task | oracle | 1.00 [1.00, 1.00] |" in page
+    assert f"Made by `sb3-sap benchmark task {CAR} --steps 40 --seeds 2 --configurations" in page
     assert {path.name for path in folder.glob("returns*")} == {
         "returns.md",
         "returns.csv",
         "returns_improvement.csv",
-        "returns.png",
         "returns.svg",
     }
-    results = collect(grid, folder / "cells", CAR, 40)
+    results = collect(grid, folder, CAR, 40)
     runs = mean_returns(results.laps)
-    assert steps_to_return(runs[runs["column"] == "ddpg:tuned[steps=100,seeds=1]"], 90).tolist() == [100]
+    assert steps_to_return(runs[runs["configuration"] == "ddpg:tuned[steps=100,seeds=1]"], 90).tolist() == [100]
     assert gym.spec(CAR).reward_threshold == 90
     assert main(["benchmark", "task", "Mountain-v0", "--out", str(tmp_path)]) == 1
     assert "No guided algorithm has settings for 'Mountain-v0'" in capsys.readouterr().err

@@ -12,7 +12,7 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-CONFIGURATIONS = "sb3_sap/benchmark/columns.py"
+CONFIGURATIONS = "sb3_sap/benchmark/groups.py"
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_a_further_benchmark_configuration_takes_one_edit(copy):
         """
         from sb3_sap.cli.main import main
         grid = "--simulator highway --steps 100 --seeds 1 --tracks eroad --out results"
-        assert main(f"benchmark summary --columns mine {grid}".split()) == 0
+        assert main(f"benchmark summary --configurations mine {grid}".split()) == 0
         """,
     )
     page = (copy / "results" / "highway-100" / "summary.md").read_text(encoding="utf-8")

@@ -488,10 +488,20 @@ COMMANDS = [
     Row("track", command("evaluate line.zip --tracks nowhere"), 1, "track must be a known name or the path"),
     Row("no.pkl", command("evaluate line.zip --vecnormalize no.pkl"), 1, "There is no file no.pkl: give the one"),
     Row("COMMAND", command("benchmark runn"), 2, "argument COMMAND: invalid choice: 'runn' .choose from 'run'"),
-    Row("ddpgap", command("benchmark run --columns ddpgap:default"), 1, "did you mean 'ddpg_ap'"),
-    Row("papr", command("benchmark run --columns ddpg_ap:papr"), 1, "'papr' is unknown: did you mean 'paper'"),
-    Row("alpha", command("benchmark run --columns 'ddpg_ap:paper[alpha]'"), 1, "'alpha' is not of the form key=value"),
-    Row("alhpa", command("benchmark run --columns 'ddpg_ap:paper[alhpa=1]' --out out"), 1, "has no setting 'alhpa'"),
+    Row("ddpgap", command("benchmark run --configurations ddpgap:default"), 1, "did you mean 'ddpg_ap'"),
+    Row("papr", command("benchmark run --configurations ddpg_ap:papr"), 1, "'papr' is unknown: did you mean 'paper'"),
+    Row(
+        "alpha",
+        command("benchmark run --configurations 'ddpg_ap:paper[alpha]'"),
+        1,
+        "'alpha' is not of the form key=value",
+    ),
+    Row(
+        "alhpa",
+        command("benchmark run --configurations 'ddpg_ap:paper[alhpa=1]' --out out"),
+        1,
+        "has no setting 'alhpa'",
+    ),
     Row("--jobs", command("benchmark run --jobs 0"), 2, "argument --jobs: must be 1 or more, but is 0"),
     Row(
         "nowhere", command("push-to-hub nowhere --repo-id a/b --dry-run"), 1, "no model nowhere: give the output folder"

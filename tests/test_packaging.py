@@ -36,7 +36,7 @@ PROGRAMS = {
         assert main(["benchmark", "report"]) == 1  # a sentence says which extra is needed
     """,
     "benchmark": """
-        grid = ["--simulator", "highway", "--columns", "linear", "--tracks", "eroad", "--out", "."]
+        grid = ["--simulator", "highway", "--configurations", "linear", "--tracks", "eroad", "--out", "."]
         assert main(["benchmark", "summary", *grid]) == 0
     """,
     "dask": "import distributed, sb3_sap.benchmark.runner",

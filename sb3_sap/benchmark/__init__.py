@@ -1,1 +1,1 @@
-"""The paper's experiments and what they are compared with."""
+"""The paper's experiments and their comparison with today's algorithms: runs, and reports of them."""

@@ -1,4 +1,4 @@
-"""Parts taken out or turned round, for what the benchmark asks alone."""
+"""Ablated variants of DDPG-AP and of its observation, used only by the benchmark."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from sb3_sap.predictor.callbacks import PermissibilityCallback
 
 
 class OtherUnits(FlattenExtractor):
-    """Lane keeping's observation in other units, of which the paper names none."""
+    """Rescales the lane-keeping observation to other units, because the paper names none.
+
+    :param observation_space: of lane keeping, shape (5,)
+    """
 
     units: tuple[float, float, float, float, float]
-    """What angle, trackPos and the three speeds are multiplied by."""
+    """Factors of angle, trackPos, speedX, speedY and speedZ."""
     scale: th.Tensor
 
     def __init__(self, observation_space: spaces.Box):
@@ -33,29 +36,29 @@ class OtherUnits(FlattenExtractor):
 
 
 class KilometresPerHour(OtherUnits):
-    """As Table 1 lists them: speeds of 50 beside an angle of hundredths."""
+    """Speeds in km/h, as Table 1 lists them: values near 50 beside an angle of hundredths."""
 
     units = (1.0, 1.0, 50.0, 50.0, 50.0)
 
 
 class TorcsKeras(OtherUnits):
-    """As in the code that the paper cites in its footnote 2: angles in π rad, speeds in 300 km/h."""
+    """Angles in π rad and speeds in 300 km/h, as in the code that the paper cites in its footnote 2."""
 
     units = (1 / math.pi, 1.0, 1 / 6, 1 / 6, 1 / 6)
 
 
 class UnbalancedFit(PermissibilityCallback):
-    """Draws D_E as K is, not balanced; validation stays balanced, so that accuracies compare."""
+    """Fits E on an unbalanced D_E; the validation set remains balanced, so that accuracies can be compared."""
 
     def fit(self) -> None:
-        """One pass over an unbalanced D_E."""
+        """Makes one pass over an unbalanced D_E."""
         model = self.model
         sample = self.knowledge.sample(model.dataset_size, env=model.get_vec_normalize_env(), balanced=False)
         self.logger.record_mean("sap/predictor_loss", model.predictor.fit(sample))
 
 
 class DDPGAPUnbalanced(DDPGAP):
-    """E learns from the labels in the proportion in which they occur."""
+    """DDPG-AP whose E learns from the labels in the proportion in which they occur."""
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if not isinstance(callback, (list, BaseCallback)):
@@ -66,7 +69,7 @@ class DDPGAPUnbalanced(DDPGAP):
 
 
 class DDPGAPProposed(DDPGAP):
-    """The replay buffer R stores the action that the actor proposed, not the one executed; K stores the latter."""
+    """DDPG-AP whose R stores the action that the actor proposed; K still stores the action that was executed."""
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
         self._proposed: np.ndarray[Any, Any] | None = None
@@ -80,5 +83,5 @@ class DDPGAPProposed(DDPGAP):
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
         super()._store_transition(replay_buffer, *args, **kwargs)
-        # Only now, because K has labelled what was executed.
+        # R is changed after it has passed the transition on to K, which labels the executed action.
         replay_buffer.actions[replay_buffer.pos - 1] = cast("np.ndarray[Any, Any]", self._proposed)

@@ -1,4 +1,4 @@
-"""From a column to a model: which class an algorithm is, and which settings it gets."""
+"""From a configuration to a model: the class of its algorithm, and its settings."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
-from sb3_sap.benchmark.columns import CONTROLLERS, Column, unknown_algorithm
+from sb3_sap.benchmark.configurations import CONTROLLERS, Configuration, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
-from sb3_sap.benchmark.tasks import entry, task_settings
+from sb3_sap.benchmark.task_settings import entry, task_settings
 from sb3_sap.common.action_noise import make_action_noise
 from sb3_sap.common.extractors import with_extractor
 from sb3_sap.common.functions import resolve
@@ -23,7 +23,7 @@ from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.presets import preset
 
-#: The class of each algorithm, imported only when it is needed.
+#: The class of each algorithm, which is imported only when it is needed.
 CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
     "dqn": "stable_baselines3:DQN",
     "qrdqn": "sb3_contrib:QRDQN",
@@ -39,17 +39,25 @@ CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} 
     "sbx_tqc": "sbx:TQC",
     "sbx_crossq": "sbx:CrossQ",
 }
-#: Algorithms that take the settings of another.
+#: Algorithms that use the settings of another one.
 NAMESAKES = {algo: algo.removeprefix("sbx_") for algo in CLASSES if algo.startswith("sbx_")} | {
     "ddpg_ap_unbalanced": "ddpg_ap",
     "ddpg_ap_proposed": "ddpg_ap",
 }
-#: An override of this kind is an option of the environment, not of the algorithm.
+#: Prefix of overrides that change the environment instead of the algorithm.
 ENVIRONMENT = "env."
 
 
+def plain_name(algo: str) -> str:
+    """The name of the algorithm whose settings a variant or another library's algorithm uses; else the name itself."""
+    return NAMESAKES.get(algo, algo)
+
+
 def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
-    """The class of an algorithm."""
+    """The class of an algorithm.
+
+    :raise ValueError: if there is no such algorithm, or if it needs SBX, which is not installed
+    """
     if algo not in CLASSES:
         raise unknown_algorithm(algo, [*CLASSES, *CONTROLLERS])
     module, _, name = CLASSES[algo].partition(":")
@@ -58,62 +66,68 @@ def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
     except ModuleNotFoundError as error:
         if module != "sbx":
             raise
-        raise ValueError(f"{algo} needs SBX, and {error.name} is missing: pip install 'sb3-sap[peers]'.") from error
+        raise ValueError(f"{algo} needs SBX, and {error.name} is missing: pip install 'sb3-sap[sbx]'.") from error
     return found
 
 
-def settings_of(column: Column, simulator: str, steps: int) -> dict[str, Any]:
-    """Constructor arguments: the preset's, with the column's overrides."""
-    if not column.learns:
-        base = _of_controller(column.algo, simulator)
+def settings_of(configuration: Configuration, simulator: str, steps: int) -> dict[str, Any]:
+    """Constructor arguments: the settings of the preset, with the overrides of the configuration.
+
+    :raise ValueError: if the algorithm has no such preset or setting
+    """
+    if not configuration.learns:
+        base = _of_controller(configuration.algo, simulator)
         known = set(base)
     else:
-        known = set(inspect.signature(algorithm_class(column.algo)).parameters)
-        namesake = NAMESAKES.get(column.algo, column.algo)
+        known = set(inspect.signature(algorithm_class(configuration.algo)).parameters)
+        namesake = plain_name(configuration.algo)
         if simulator in ENVIRONMENTS:
-            base = preset(column.preset, namesake, steps)
+            base = preset(configuration.preset, namesake, steps)
         else:
-            base = task_settings(namesake, column.preset, simulator, known)
-        if column.algo.startswith("sbx_"):
+            base = task_settings(namesake, configuration.preset, simulator, known)
+        if configuration.algo.startswith("sbx_"):
             base = _for_sbx(base)
     settings = copy.deepcopy(base)
-    for key, value in column.changes.items():
+    for key, value in configuration.changes.items():
         if not key.startswith(ENVIRONMENT):
             _set(settings, key.split("."), value)
     for name in settings.keys() - known:
-        raise ValueError(f"{column.name}: {column.algo} has no setting {name!r}.")
+        raise ValueError(f"{configuration.name}: {configuration.algo} has no setting {name!r}.")
     return settings
 
 
 def _of_controller(algo: str, simulator: str) -> dict[str, Any]:
-    """Parameters of a controller that learns nothing: gains for a lane, an AP function for what can be copied."""
+    """Parameters of a controller: gains of the linear one, the AP function of the look-ahead oracle."""
     if algo == "linear" and simulator in GAINS:
         return dict(GAINS[simulator])
-    if algo == "rule" and simulator not in ENVIRONMENTS and "ap_function" in (own := entry(algo, simulator)):
+    if algo == "oracle" and simulator not in ENVIRONMENTS and "ap_function" in (own := entry(algo, simulator)):
         return {"ap_function": own["ap_function"]}
     needed = "lane keeping" if algo == "linear" else "a task whose entry in zoo_configs names an AP function"
-    raise ValueError(f"The column {algo} is for {needed}, but {simulator} is not.")
+    raise ValueError(f"The configuration {algo} is for {needed}, but {simulator} is not.")
 
 
-def defaults_of(column: Column, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The constructor's own values of what the settings leave open: when a library changes them, results are others."""
-    if not column.learns:
+def defaults_of(configuration: Configuration, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The constructor's defaults of all other arguments: if a release changes them, the results are no longer valid."""
+    if not configuration.learns:
         return {}
-    parameters = inspect.signature(algorithm_class(column.algo)).parameters.values()
+    parameters = inspect.signature(algorithm_class(configuration.algo)).parameters.values()
     plain = (bool, int, float, str, tuple, type(None))
     return {p.name: p.default for p in parameters if p.name not in settings and isinstance(p.default, plain)}
 
 
-def environment_of(column: Column) -> dict[str, Any]:
-    """Options of the training environment."""
-    return {key.removeprefix(ENVIRONMENT): v for key, v in column.changes.items() if key.startswith(ENVIRONMENT)}
+def environment_of(configuration: Configuration) -> dict[str, Any]:
+    """Options of the training environment that the configuration overrides."""
+    return {key.removeprefix(ENVIRONMENT): v for key, v in configuration.changes.items() if key.startswith(ENVIRONMENT)}
 
 
 def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> OffPolicyAlgorithm:
-    """A fresh model on the processor, where networks this small are fastest."""
+    """Builds a model on the CPU, where networks this small are fastest.
+
+    :param settings: constructor arguments as YAML writes them
+    """
     cls = algorithm_class(algo)
     arguments = copy.deepcopy(dict(settings))
-    if not issubclass(cls, SettingsMixin):  # which reads what YAML can write by itself
+    if not issubclass(cls, SettingsMixin):  # whose constructor converts YAML values itself
         if isinstance(arguments.get("action_noise"), Mapping):
             arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
         if "learning_rate" in arguments:
@@ -127,7 +141,7 @@ def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> O
 
 
 def _for_sbx(settings: dict[str, Any]) -> dict[str, Any]:
-    """The same settings as SBX names them: its critics have a rate of their own, in DDPG and TD3 by default."""
+    """Renames settings for SBX, whose critics have a separate learning rate, by default another one in DDPG and TD3."""
     settings = dict(settings)
     if "learning_rate" in settings:
         settings["qf_learning_rate"] = settings["learning_rate"]

@@ -1,7 +1,7 @@
-"""A process for each cell, so that start-up counts, threads stay apart and a crash hurts nobody else.
+"""A process of its own for each run, so that start-up counts, threads remain separate and a crash affects no other run.
 
-The parent writes one line of JSON to the child's standard input and keeps that open; the child answers with one line
-on its standard output. When the input ends, the parent is gone, however it died, and the child goes too.
+The parent writes one line of JSON to the child's standard input and keeps it open; the child answers with one line on
+its standard output. The child exits when its input ends, so that it never outlives a parent that was killed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import threading
 import time
 from typing import Any
 
-from sb3_sap.benchmark.cells import Cell
+from sb3_sap.benchmark.runs import Run
 
-#: One thread each: networks this small run no faster on two, and cells run side by side.
+#: One thread for each run: networks this small train no faster on two, and runs may be side by side.
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -28,8 +28,8 @@ SINGLE_THREADED = {
 _running: set[subprocess.Popen[str]] = set()
 
 
-def run_in_own_process(cell: Cell) -> dict[str, Any]:
-    """The result of a cell, or ``{"error": sentence}``; never an exception, so that other cells go on."""
+def run_in_own_process(run: Run) -> dict[str, Any]:
+    """The result of a run, or ``{"error": sentence}``; it never raises an exception, so that other runs continue."""
     process = subprocess.Popen(
         [sys.executable, "-m", __name__],
         stdin=subprocess.PIPE,
@@ -37,7 +37,7 @@ def run_in_own_process(cell: Cell) -> dict[str, Any]:
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | SINGLE_THREADED,
-        start_new_session=True,  # Ctrl-C is for the parent, who then stops the children
+        start_new_session=True,  # Ctrl-C reaches the parent alone, which then stops the children
     )
     _running.add(process)
     assert process.stdin is not None
@@ -47,7 +47,7 @@ def run_in_own_process(cell: Cell) -> dict[str, Any]:
     reader = threading.Thread(target=lambda stream: errors.extend(stream), args=(process.stderr,), daemon=True)
     reader.start()
     try:
-        process.stdin.write(json.dumps({"cell": cell.description(), "began": time.monotonic()}) + "\n")
+        process.stdin.write(json.dumps({"run": run.description(), "began": time.monotonic()}) + "\n")
         process.stdin.flush()
         answer = process.stdout.readline()
         process.stdin.close()
@@ -68,38 +68,38 @@ def run_in_own_process(cell: Cell) -> dict[str, Any]:
 
 
 def stop_all() -> None:
-    """Ends the cells that run in this process' children."""
+    """Kills the child processes of all runs in progress."""
     for process in list(_running):
         process.kill()
 
 
 def main() -> None:
-    """The child's side."""
-    # What libraries print must not end up in the answer.
+    """Entry point of the child process."""
+    # The answer gets a descriptor of its own, because libraries may print to standard output.
     answer = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     request = json.loads(sys.stdin.readline())
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-    answer.write(json.dumps(_result(Cell(**request["cell"]), request["began"])) + "\n")
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    answer.write(json.dumps(_result(Run(**request["run"]), request["began"])) + "\n")
     answer.flush()
-    os._exit(0)  # the answer is out, and what libraries do when they are torn down must not be waited for
+    os._exit(0)  # without waiting for libraries to shut down
 
 
-def _result(cell: Cell, began: float) -> dict[str, Any]:
+def _result(run: Run, began: float) -> dict[str, Any]:
     import torch as th
 
     from sb3_sap.benchmark.provenance import provenance
-    from sb3_sap.benchmark.training import run_cell
+    from sb3_sap.benchmark.training import train_and_evaluate
 
     th.set_num_threads(1)
     try:
-        tables = run_cell(cell, began)
+        tables = train_and_evaluate(run, began)
     except Exception as error:
         return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
-    return {"cell": cell.description(), "made": provenance(), **tables}
+    return {"run": run.description(), "made": provenance(), **tables}
 
 
-def _leave_with_parent() -> None:
+def _exit_with_parent() -> None:
     while os.read(0, 1):
         pass
     os._exit(1)

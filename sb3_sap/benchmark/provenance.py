@@ -1,4 +1,4 @@
-"""What a result was made with: versions, kind of machine, date and revision, and nothing private."""
+"""Provenance of a result: versions, kind of machine, date and revision, and nothing private."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PACKAGES = (
 
 
 def provenance() -> dict[str, Any]:
-    """Taken in the process that made the result."""
+    """The provenance of a result that this process makes."""
     return {
         "versions": {"python": platform.python_version()} | _versions(),
         "machine": machine_kind(),
@@ -45,7 +45,7 @@ def _versions() -> dict[str, str]:
 
 
 def machine_kind() -> str:
-    """Processor, cores and system."""
+    """Processor model, number of cores and operating system."""
     processor = platform.processor() or platform.machine()
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
@@ -57,7 +57,7 @@ def machine_kind() -> str:
 
 
 def revision() -> str | None:
-    """The commit of a checkout, marked where the package differs from it; None for an installed package."""
+    """The commit of a checkout, marked as dirty if files differ from it; None for an installed package."""
     folder = Path(__file__).parents[2]
     if not (folder / ".git").exists():
         return None

@@ -1,0 +1,90 @@
+"""Tasks beyond lane keeping: the configurations that are compared on an environment of ``zoo_configs``.
+
+The "simulator" of such a run is the id of the environment, its "tracks" are the seeds of the evaluation episodes, and
+the score of an episode is its return.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sb3_sap.algorithms import ALGORITHMS, base_of, is_guided
+from sb3_sap.common.errors import nearest
+from sb3_sap.presets import algorithms, load_config, settings_in
+
+#: Seeds of the evaluation episodes, the same in every run.
+EPISODES = tuple(map(str, range(10_000, 10_010)))
+#: Number of evaluations of a training, at equal distances.
+EVALUATIONS = 20
+#: Baselines with RL Zoo's tuned settings train for at most this many times the steps of the guided algorithm.
+LONGER = 10
+#: Number of seeds of such a baseline.
+FEWER = 3
+
+
+def guided_algorithms(env_id: str) -> list[str]:
+    """The guided algorithms that have settings for an environment.
+
+    :raise ValueError: if there is none
+    """
+    guided = [algo for algo in ALGORITHMS if is_guided(algo)]
+    found = [algo for algo in guided if env_id in load_config(algo)]
+    if not found:
+        known = {name for algo in guided for name in load_config(algo) if "-v" in name}
+        raise ValueError(f"No guided algorithm has settings for {env_id!r} in zoo_configs: {nearest(env_id, known)}")
+    return found
+
+
+def entry(algo: str, env_id: str) -> dict[str, Any]:
+    """The entry of an algorithm in ``zoo_configs``, or else of the guided algorithm that builds on it."""
+    guided = guided_algorithms(env_id)
+    own = next((name for name in guided if name == algo or base_of(name) == base_of(algo)), guided[0])
+    return load_config(own)[env_id]
+
+
+def task_configurations(env_id: str) -> list[str]:
+    """The configurations that are compared on a task.
+
+    They are each guided algorithm with an entry, its base with the same settings, its base with RL Zoo's tuned settings
+    if there are any, and the look-ahead oracle unless the environment itself labels the actions.
+    """
+    configurations = []
+    for algo in guided_algorithms(env_id):
+        base = base_of(algo)
+        configurations += [f"{algo}:task", f"{base}:task"]
+        tuned = load_config(base).get(env_id) if base in algorithms() else None
+        if tuned:
+            steps = min(int(tuned["n_timesteps"]), LONGER * planned_steps(env_id))
+            configurations.append(f"{base}:tuned[steps={steps},seeds={FEWER}]")
+    return configurations + (["oracle"] if "ap_function" in entry("oracle", env_id) else [])
+
+
+def planned_steps(env_id: str) -> int:
+    """Training steps of the first guided algorithm with an entry."""
+    return int(entry(guided_algorithms(env_id)[0], env_id)["n_timesteps"])
+
+
+def task_settings(algo: str, preset: str, env_id: str, known: set[str]) -> dict[str, Any]:
+    """Constructor arguments for a task.
+
+    :param preset: "default", the library's defaults; "task", the entry of the guided algorithm, without what an
+        unguided base does not know; "tuned", RL Zoo's settings of the base
+    :param known: parameters of the constructor
+    :raise ValueError: if the algorithm has no such preset for the environment
+    """
+    if preset == "default":
+        return {}
+    if preset == "task":
+        settings = settings_in(entry(algo, env_id))
+        return settings if is_guided(algo) else {key: value for key, value in settings.items() if key in known}
+    tuned = load_config(algo).get(env_id) if not is_guided(algo) and algo in algorithms() else None
+    if preset != "tuned" or tuned is None:
+        raise ValueError(
+            f"{algo} has no preset {preset!r} for {env_id}: choose 'default', 'task', or 'tuned' for a base."
+        )
+    return settings_in(tuned)
+
+
+def evaluations(steps: int) -> list[int]:
+    """Training steps after which the actor is evaluated."""
+    return sorted({*range(steps // EVALUATIONS, steps, max(1, steps // EVALUATIONS)), steps} - {0})

@@ -9,7 +9,8 @@ import sys
 import torch as th
 from rich.console import Console
 
-from sb3_sap import __version__, zoo
+import sb3_sap
+from sb3_sap import zoo
 from sb3_sap.benchmark.cli import add_benchmark
 from sb3_sap.cli.demo import add_demo
 from sb3_sap.cli.evaluate import add_evaluate
@@ -38,10 +39,8 @@ def _find_modules_of_current_folder() -> None:
 
 def parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    root = argparse.ArgumentParser(
-        prog="sb3-sap", description="Learn which actions are permissible while learning to act."
-    )
-    root.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    root = argparse.ArgumentParser(prog="sb3-sap", description=sb3_sap.__doc__)
+    root.add_argument("--version", action="version", version=f"%(prog)s {sb3_sap.__version__}")
     commands = root.add_subparsers(title="commands", required=True, metavar="COMMAND")
     add_demo(commands)
     add_evaluate(commands)

@@ -37,10 +37,10 @@ class Foresight(NamedTuple):
     """Balanced accuracies on examples that were never trained on."""
 
     accuracy: float
+    #: Of the same classifier, to which every action is zero.
     accuracy_without_action: float
-    """Of the same classifier, to which every action is zero."""
+    #: Accuracy that is lost when one dimension of the action is shuffled among the examples.
     action_informs: tuple[float, ...]
-    """Accuracy that is lost when one dimension of the action is shuffled among the examples."""
 
 
 def foresee(

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from sb3_sap.common.files import atomic_path
 
+#: s of driving in ``check``.
 CHECK_SECONDS = 5.0
-"""s of driving in ``check``."""
 
 
 def add_torcs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -11,8 +11,8 @@ from sb3_sap.envs.constraints import constraint_ce1, constraint_ce2
 from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD, LaneKeepingEnv, ap_function, score
 from sb3_sap.envs.tracks import TRACKS, Track, get_track
 
+#: Enough for a lap of the longest track (Spring, 8,000 steps at 50 km/h and 0.2 s); ends episodes of ``laps=None``.
 MAX_EPISODE_STEPS = 10_000
-"""Enough for a lap of the longest track (Spring, 8,000 steps at 50 km/h and 0.2 s); ends episodes of ``laps=None``."""
 
 
 def make_lane_keeping(

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+#: Ends of the steering range.
 FULL_LEFT, FULL_RIGHT = 1.0, -1.0
-"""Ends of the steering range."""
 
 Interval = tuple[NDArray[Any], NDArray[Any]]
 

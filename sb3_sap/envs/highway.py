@@ -18,13 +18,12 @@ from sb3_sap.envs.car import STEERING_LOCK, CarState
 from sb3_sap.envs.tracks import Piece, Track, get_track
 from sb3_sap.envs.units import KMH
 
+#: km/h. Below the first highway-env's model damps all turning; above the second it brakes.
 MIN_SPEED, MAX_SPEED = 5.0, 144.0
-"""km/h. Below the first highway-env's model damps all turning; above the second it brakes."""
+#: s, longest step of the integration at 50 km/h and above (see `HighwaySimulator`).
 SUB_STEP = 0.05
-"""s, longest step of the integration at 50 km/h and above (see `HighwaySimulator`)."""
+#: km/h. At lower speeds the sub-step shrinks in proportion.
 SUB_STEP_SPEED = 50.0
-"""km/h. At lower speeds the sub-step shrinks in proportion."""
-"""km/h in 1 m/s."""
 
 
 def road_lane(piece: Piece, width: float) -> AbstractLane:

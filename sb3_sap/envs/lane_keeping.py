@@ -18,22 +18,22 @@ from sb3_sap.common.errors import nearest
 from sb3_sap.envs.car import CarState, Simulator
 from sb3_sap.envs.units import KMH
 
+#: What one unit of the observation is: angle 1 rad, trackPos 1, speedX, speedY and speedZ 50 km/h (Table 1's order).
 OBSERVATION_SCALE = np.array([1.0, 1.0, 50.0, 50.0, 50.0])
-"""What one unit of the observation is: angle 1 rad, trackPos 1, speedX, speedY and speedZ 50 km/h (Table 1's order)."""
+#: Largest magnitudes that an observation shows: rad, trackPos, km/h. What lies beyond is clipped.
 OBSERVATION_LIMIT = np.array([math.pi, 2.0, 200.0, 200.0, 200.0])
-"""Largest magnitudes that an observation shows: rad, trackPos, km/h. What lies beyond is clipped."""
+#: Reward of the step that leaves the road or turns the car backwards (the value of the code that the paper cites).
 OFF_TRACK_REWARD = -200.0
-"""Reward of the step that leaves the road or turns the car backwards (the value of the code that the paper cites)."""
+#: km/h. A car whose |V_x| stays below it stands still …
 STILL_SPEED = 1.0
-"""km/h. A car whose |V_x| stays below it stands still …"""
+#: … and after so many seconds of that the episode ends …
 STILL_TIME = 5.0
-"""… and after so many seconds of that the episode ends …"""
+#: … not counting the first seconds of the episode, in which a simulator may have to start the car from rest.
 GRACE_TIME = 3.0
-"""… not counting the first seconds of the episode, in which a simulator may have to start the car from rest."""
+#: Random starts lie within this |trackPos| …
 RANDOM_TRACK_POS = 0.5
-"""Random starts lie within this |trackPos| …"""
+#: … and within this |angle|, in rad.
 RANDOM_ANGLE = 0.2
-"""… and within this |angle|, in rad."""
 
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]

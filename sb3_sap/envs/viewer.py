@@ -21,28 +21,28 @@ from numpy.typing import NDArray
 from sb3_sap.envs.car import STEERING_LOCK, CarState
 from sb3_sap.envs.tracks import Track
 
+#: Width and height of the picture, in pixels.
 SIZE = (600, 400)
-"""Width and height of the picture, in pixels."""
+#: The world is drawn so many times larger and scaled down, for smooth edges.
 OVERSAMPLING = 2
-"""The world is drawn so many times larger and scaled down, for smooth edges."""
+#: Pixels per metre of the world.
 SCALING = 9.0
-"""Pixels per metre of the world."""
+#: m between two points of the road's edges.
 ROAD_STEP = 1.0
-"""m between two points of the road's edges."""
+#: m from one dash of the centre line to the next; each is as long as highway-env's stripes.
 DASH_EVERY = 9.0
-"""m from one dash of the centre line to the next; each is as long as highway-env's stripes."""
+#: Longest side of the map, in pixels.
 MAP_SIZE = 96
-"""Longest side of the map, in pixels."""
+#: m between two points of the map's line.
 MAP_STEP = 10.0
-"""m between two points of the map's line."""
+#: Pixels around the map and the panel's text.
 MARGIN = 12
-"""Pixels around the map and the panel's text."""
+#: Pixels.
 PANEL_HEIGHT = 34
-"""Pixels."""
+#: m from the middle of the car to the end of the fan.
 FAN_RADIUS = 13.0
-"""m from the middle of the car to the end of the fan."""
+#: Of 255.
 FAN_OPACITY = 150
-"""Of 255."""
 
 GRASS, ASPHALT, LINE = (112, 150, 84), (138, 140, 145), (245, 245, 240)
 CAR, PANEL, ACCENT = (58, 140, 230), (28, 32, 38), (255, 190, 60)

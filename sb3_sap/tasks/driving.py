@@ -11,21 +11,21 @@ from sb3_sap.common.arrays import BoolArray, FloatArray
 
 Array = np.ndarray[Any, Any]
 
+#: Distance to the parking place within which a car may have to turn away to get in, in units of 100 m.
 GOAL_RADIUS = 0.1
-"""Distance to the parking place within which a car may have to turn away to get in, in units of 100 m."""
+#: m/s², a little less than the car can brake with.
 BRAKING = 4.0
-"""m/s², a little less than the car can brake with."""
 
+#: m, m, m/s and m/s that one unit of x, y, vx and vy is in the highway's observation.
 SCALES = np.array([100.0, 12.0, 20.0, 20.0], dtype=np.float32)
-"""m, m, m/s and m/s that one unit of x, y, vx and vy is in the highway's observation."""
+#: m between the middles of two cars, along and to the side, below which they may touch: a car is 5 by 2 m.
 CAR_LENGTH, CLEARANCE = 6.0, 3.0
-"""m between the middles of two cars, along and to the side, below which they may touch: a car is 5 by 2 m."""
+#: s ahead at which it is looked where everybody will be.
 AHEAD = np.linspace(0, 3, 13, dtype=np.float32)
-"""s ahead at which it is looked where everybody will be."""
+#: m, where the road of three lanes ends.
 LEFT_EDGE, RIGHT_EDGE = -2.0, 10.0
-"""m, where the road of three lanes ends."""
+#: s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake.
 EDGE_TIME = 1.0
-"""s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
 
 
 def parking(obs: Mapping[str, Array], actions: Array, next_obs: Mapping[str, Array]) -> BoolArray:

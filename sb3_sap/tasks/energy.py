@@ -13,19 +13,19 @@ Array = np.ndarray[Any, Any]
 
 # Gymnasium's mountain_car.py: per step, v' = v + push - GRAVITY·cos(3x), then x' = x + v'.
 GRAVITY = 0.0025
+#: Push of one action of ``MountainCar-v0``.
 POWER = 0.001
-"""Push of one action of ``MountainCar-v0``."""
+#: x, where the slope before the flag pulls back exactly as hard as that push.
 FLAG_BARRIER = math.acos(POWER / GRAVITY) / 3
-"""x, where the slope before the flag pulls back exactly as hard as that push."""
 
+#: Force along the motion below which a step counts as idle.
 IDLE = 0.1
-"""Force along the motion below which a step counts as idle."""
 
 # Gymnasium's acrobot.py: both links are 1 m and 1 kg, their centres of mass in the middle, with 1 kg·m² of inertia.
 ACROBOT_GRAVITY = 9.8
 ACROBOT_INERTIA = 1.0
+#: J. At rest with the first link level and the second upright, the tip is at the line and no lower energy is there.
 LEAST_ENERGY_OF_GOAL = 0.5 * ACROBOT_GRAVITY
-"""J. At rest with the first link level and the second upright, the tip is at the line and no lower energy is there."""
 
 
 def mountain_car_continuous(obs: Array, actions: Array, next_obs: Array) -> BoolArray:

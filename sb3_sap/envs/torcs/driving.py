@@ -13,24 +13,24 @@ from sb3_sap.envs.lane_keeping import OBSERVATION_LIMIT, OBSERVATION_SCALE, Lane
 from sb3_sap.envs.torcs.simulator import TorcsSimulator
 from sb3_sap.envs.units import KMH
 
+#: m ahead of the car at which the road's curvature is observed.
 LOOK_AHEAD = (5.0, 10.0, 20.0, 35.0, 55.0, 80.0, 110.0, 150.0)
-"""m ahead of the car at which the road's curvature is observed."""
+#: 1/m that one unit of the observation is, a curve of 50 m radius.
 CURVATURE_SCALE = 0.02
-"""1/m that one unit of the observation is, a curve of 50 m radius."""
+#: Largest magnitude of an observed curvature, in those units.
 CURVATURE_LIMIT = 5.0
-"""Largest magnitude of an observed curvature, in those units."""
+#: m/s². More than the tyres can give in any direction (about 1.5 g): what it cannot do cannot be done.
 MAX_ACCELERATION = 20.0
-"""m/s². More than the tyres can give in any direction (about 1.5 g): what it cannot do cannot be done."""
+#: m/s². Less than the tyres give on any road (about 0.3 g): what this can do is always possible.
 SURE_ACCELERATION = 3.0
-"""m/s². Less than the tyres give on any road (about 0.3 g): what this can do is always possible."""
+#: rad and half widths within which a car is well placed.
 SURE_ANGLE, SURE_TRACK_POS = 0.2, 0.5
-"""rad and half widths within which a car is well placed."""
+#: s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake.
 EDGE_TIME = 1.0
-"""s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
+#: Where the observation holds half the road's width …
 HALF_WIDTH = slice(5 + len(LOOK_AHEAD), 6 + len(LOOK_AHEAD))
-"""Where the observation holds half the road's width …"""
+#: … in units of 10 m.
 WIDTH_SCALE = 10.0
-"""… in units of 10 m."""
 
 
 def lateral_velocity(obs: NDArray[Any]) -> NDArray[Any]:

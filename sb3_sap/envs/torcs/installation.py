@@ -16,6 +16,7 @@ from sb3_sap.common.errors import nearest
 LIBRARIES = Path("usr/lib/x86_64-linux-gnu")
 DATA = Path("usr/share/games/torcs")
 MODULES = {"simu": LIBRARIES / "torcs/modules/simu/simuv2.so", "track": LIBRARIES / "torcs/modules/track/track.so"}
+#: In the order in which they must be loaded.
 SHARED = (
     LIBRARIES / "torcs/lib/libtxml.so",
     LIBRARIES / "torcs/lib/libtgf.so",
@@ -23,10 +24,9 @@ SHARED = (
     LIBRARIES / "libplibul.so.1",
     LIBRARIES / "libplibsg.so.1",
 )
-"""In the order in which they must be loaded."""
 HOW_TO_INSTALL = "run `sb3-sap torcs install`, or `apt-get install torcs` on Debian, or set TORCS_ROOT to where it is"
+#: Debian's torcs for amd64, whose structures are known; ``checksums.txt`` has the SHA-256 of each file that is used.
 VERSION = "1.3.7+dfsg-5+b2"
-"""Debian's torcs for amd64, whose structures are known; ``checksums.txt`` has the SHA-256 of each file that is used."""
 
 
 class TorcsNotFoundError(RuntimeError):

@@ -19,10 +19,10 @@ from sb3_sap.envs.torcs.structures import LocalPosition
 
 _Position = ctypes.POINTER(LocalPosition)
 _Float = ctypes.POINTER(ctypes.c_float)
+#: GfParmReadFile: read the file as it is.
 READ_STANDARD = 1
-"""GfParmReadFile: read the file as it is."""
+#: GfParmMergeHandles: sources and parameters of both, the handles released.
 MERGE_ALL = 15
-"""GfParmMergeHandles: sources and parameters of both, the handles released."""
 
 
 _reading = threading.RLock()

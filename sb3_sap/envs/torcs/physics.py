@@ -18,21 +18,21 @@ from sb3_sap.envs.torcs.road import Road
 from sb3_sap.envs.torcs.structures import PLACED, RUNNING, RaceStructure, SituationStructure
 from sb3_sap.envs.torcs.track_files import flatten
 
+#: s, one step of the physics.
 TICK = 0.002
-"""s, one step of the physics."""
+#: m above the road at which a car is placed.
 DROP_HEIGHT = 0.2
-"""m above the road at which a car is placed."""
+#: The race engine lets the car come to rest with the brake on, for one second.
 SETTLE_TICKS = 500
-"""The race engine lets the car come to rest with the brake on, for one second."""
 MAX_DAMAGE = 10_000
+#: 0 rookie to 3 pro; the level changes the grip of the tyres.
 SKILL_LEVELS = range(4)
-"""0 rookie to 3 pro; the level changes the grip of the tyres."""
+#: TORCS' limit; a car ignores gears that it lacks.
 MAX_GEAR = 8
-"""TORCS' limit; a car ignores gears that it lacks."""
+#: Of fuel and damage.
 MAX_FACTOR = 100.0
-"""Of fuel and damage."""
+#: Where, and how long, files that TORCS does not ship are tried out.
 TRIAL_PLACES, TRIAL_TICKS = 40, 100
-"""Where, and how long, files that TORCS does not ship are tried out."""
 
 
 class Physics(CarReadings):

@@ -16,8 +16,8 @@ from sb3_sap.envs.torcs.track_files import flatten
 from sb3_sap.envs.tracks import read_track_xml
 from sb3_sap.envs.units import KMH
 
+#: m before the start line, where the training start is.
 TRAINING_DISTANCE = 100.0
-"""m before the start line, where the training start is."""
 STARTS = ("training", "race")
 
 

@@ -5,24 +5,24 @@ from __future__ import annotations
 from sb3_sap.envs.torcs.physics import Physics
 from sb3_sap.envs.units import KMH
 
+#: Ticks between two decisions, 50 Hz. Shifting cuts the throttle command, so the controls are written each time.
 PERIOD_TICKS = 10
-"""Ticks between two decisions, 50 Hz. Shifting cuts the throttle command, so the controls are written each time."""
+#: Throttle per km/h below the target.
 GAIN = 0.08
-"""Throttle per km/h below the target."""
+#: Throttle per km/h and second below it.
 INTEGRAL_GAIN = 0.02
-"""Throttle per km/h and second below it."""
+#: km/h above the target from which the brake helps …
 BRAKE_MARGIN = 3.0
-"""km/h above the target from which the brake helps …"""
+#: … by so much per km/h.
 BRAKE_GAIN = 0.05
-"""… by so much per km/h."""
+#: rad/s. While the rear wheels together spin so much faster than the front wheels, the throttle is halved.
 SLIP = 5.0
-"""rad/s. While the rear wheels together spin so much faster than the front wheels, the throttle is halved."""
+#: Fractions of the engine's red line: shift up above the first, down where the lower gear stays below the second …
 SHIFT_UP, SHIFT_DOWN = 0.835, 0.7
-"""Fractions of the engine's red line: shift up above the first, down where the lower gear stays below the second …"""
+#: … and s for which it then stays.
 SHIFT_TIME = 0.5
-"""… and s for which it then stays."""
+#: s
 PERIOD = 0.02
-"""s"""
 
 
 class SpeedHolder:

@@ -11,17 +11,17 @@ from pathlib import Path
 
 from sb3_sap.envs.tracks.geometry import Segment, Track
 
+#: The table's columns. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the others.
 COLUMNS = ("type", "length_m", "radius_m", "end_radius_m", "turn_deg", "steps")
-"""The table's columns. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the others."""
 
+#: Steps that a segment may be cut into. TORCS' own tracks have at most a few hundred; each takes memory and time.
 MAX_STEPS = 10_000
-"""Steps that a segment may be cut into. TORCS' own tracks have at most a few hundred; each takes memory and time."""
 
+#: Units of length and angle in track files, in m and rad.
 UNITS = {"m": 1.0, "km": 1000.0, "cm": 0.01, "mm": 0.001, "ft": 0.304801, "deg": math.pi / 180, "rad": 1.0}
-"""Units of length and angle in track files, in m and rad."""
 
+#: What newer and older files call the list of segments.
 SEGMENT_LISTS = ("Track Segments", "segments")
-"""What newer and older files call the list of segments."""
 
 
 def parse_table(lines: Iterable[str], name: str) -> Track:

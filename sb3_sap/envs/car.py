@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 from sb3_sap.envs.tracks import Track
 
-#: rad that the front wheels turn at steering 1, 21° (Table 1).
+#: Angle that the front wheels turn at steering 1, rad (21°, Table 1).
 STEERING_LOCK = 0.366519
 
 
@@ -17,7 +17,7 @@ class CarState(NamedTuple):
     #:
     #: The sign is that of TORCS' sensors: positive steering corrects a positive angle.
     angle: float
-    #: 2 · (distance to the left of the centre line) / width: 0 on the axis, 1 at the left edge, -1 at the right.
+    #: 2 · (distance to the left of the centre line, or axis) / width: 1 at the left edge, -1 at the right.
     track_pos: float
     #: km/h, along the car's longitudinal axis.
     speed_x: float
@@ -42,7 +42,7 @@ class Simulator(Protocol):
     start: dict[str, float]
 
     def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
-        """Put the car on the road, as `CarState` says it, and return where it stands."""
+        """Put the car on the road, with the units and signs of `CarState`, and return its state."""
         ...
 
     def step(self, steering: float) -> CarState:

@@ -1,4 +1,4 @@
 """Units of measurement."""
 
-#: km/h that one m/s is.
+#: km/h per m/s.
 KMH = 3.6

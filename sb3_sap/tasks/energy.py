@@ -1,4 +1,4 @@
-"""Climbing with a motor that is too weak: a mistake is to put no energy in where it is still missing."""
+"""Climbing with a motor that is too weak: it is a mistake to add no energy while energy is missing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = np.ndarray[Any, Any]
 GRAVITY = 0.0025
 #: Push of one action of ``MountainCar-v0``.
 POWER = 0.001
-#: x, where the slope before the flag pulls back exactly as hard as that push.
+#: Position x at which the slope before the flag pulls back exactly as hard as that push.
 FLAG_BARRIER = math.acos(POWER / GRAVITY) / 3
 
 #: Force along the motion below which a step counts as idle.
@@ -24,7 +24,7 @@ IDLE = 0.1
 # Gymnasium's acrobot.py: both links are 1 m and 1 kg, their centres of mass in the middle, with 1 kg·m² of inertia.
 ACROBOT_GRAVITY = 9.8
 ACROBOT_INERTIA = 1.0
-#: J. At rest with the first link level and the second upright, the tip is at the line and no lower energy is there.
+#: Lowest energy with the tip at the line, J: at rest, the first link level and the second upright.
 LEAST_ENERGY_OF_GOAL = 0.5 * ACROBOT_GRAVITY
 
 
@@ -64,7 +64,7 @@ def mountain_car(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 
 def flag_within_reach(obs: Array) -> BoolArray:
-    """Where pushing right from now on leads to the flag of ``MountainCar-v0``; (n,) of (n, 2)."""
+    """Where pushing right from now on leads to the flag of ``MountainCar-v0``; (n,) bool of (n, 2) observations."""
     x, v = obs[:, 0].astype(float), obs[:, 1].astype(float)
     reach: BoolArray = 0.5 * v**2 + _height_against_push(x) >= _height_against_push(FLAG_BARRIER)
     return reach
@@ -91,7 +91,7 @@ def acrobot(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 
 def acrobot_energy(obs: Array) -> FloatArray:
-    """Mechanical energy of both links, J, 0 where both are level; (n,) of (n, 6)."""
+    """Mechanical energy of both links, (n,) J, 0 where both are level at rest, of (n, 6) observations."""
     cos1, sin1, cos2, sin2, rate1, rate2 = obs.T.astype(float)
     # Of a link: at its centre of mass, and turning about it.
     speed1 = 0.25 * rate1**2

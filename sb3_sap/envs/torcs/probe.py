@@ -12,7 +12,7 @@ import signal
 import warnings
 from collections.abc import Callable
 
-#: s after which a trial is given up.
+#: Time after which a trial is given up, s.
 TIME_LIMIT = 10
 #: Exit status of a trial that came to its end; TORCS ends a process with 0 or 1.
 SURVIVED = 42

@@ -24,7 +24,7 @@ TRACKS = {
 
 
 def get_track(track: str | os.PathLike[str] | Track) -> Track:
-    """Return the track that is meant.
+    """Return a track by its name, its seed or its file.
 
     :param track: a key of `TRACKS`; ``"random:SEED"`` for a generated track (``"random"`` is ``"random:0"``); the path
         of a TORCS track file (``.xml``) or of a table such as `write_table` writes; or a `Track`, returned as it is

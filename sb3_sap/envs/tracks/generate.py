@@ -8,15 +8,15 @@ import numpy as np
 
 from sb3_sap.envs.tracks.geometry import Segment, Track
 
-#: m, as Wheel-2.
+#: Width of the road, m, as of Wheel-2.
 WIDTH = 12.0
-#: Fewest and most corners of the polygon.
+#: Minimum and maximum number of corners of the polygon.
 CORNERS = (8, 14)
-#: m from the polygon's middle to a corner.
+#: Distance from the polygon's middle to a corner, m.
 CORNER_DISTANCE = (150.0, 450.0)
-#: m, of the curves. A steering lock of 21° at a wheelbase of 5 m turns on 13 m.
+#: Radii of the curves, m. With a steering lock of 21° and a wheelbase of 5 m, a car can turn at 13 m.
 MIN_RADIUS, MAX_RADIUS = 25.0, 120.0
-#: m that every straight keeps between the curves at its ends.
+#: Length that every straight keeps between the curves at its ends, m.
 MIN_STRAIGHT = 10.0
 
 

@@ -69,7 +69,7 @@ def try_actions(env: gym.Env[Any, Any], function: APFunction | None, seed: int) 
                 return None, None
         labels = label(sweep, function)
         changes.append(int(np.count_nonzero(np.diff(labels))))
-        # One dimension alone rarely changes a label that depends on several.
+        # A sweep of one dimension rarely changes a label that depends on several.
         decides.append(
             changes[-1] > 0
             or (

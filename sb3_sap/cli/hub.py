@@ -147,12 +147,12 @@ def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) 
             )
         ],
     )
-    shown = [name for name in EXTRAS[:3] if folder / name in files]
+    pictures = [name for name in EXTRAS[:3] if folder / name in files]
     text = CARD.format(
         algo=trained.algo,
         env_id=trained.env_id,
         class_name=class_name,
-        pictures="".join(f"\n\n![{Path(name).stem.replace('_', ' ')}]({name})" for name in shown),
+        pictures="".join(f"\n\n![{Path(name).stem.replace('_', ' ')}]({name})" for name in pictures),
         results=results,
         use=use.format(
             class_name=class_name,

@@ -44,7 +44,7 @@ class WatchedEnvironmentMixin(SettingsMixin):
         self._warned_of_sharing = False
         env = cast(VecEnv, self.env)
         if self._last_obs is not None and not is_at(env, normalize, self._last_obs, self._last_original_obs):
-            # Other code, such as an evaluation, stepped it since: the next transition would begin in another state.
+            # Other code, such as an evaluation, stepped `env` since: the next transition would begin in another state.
             self._last_obs = None
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 

@@ -167,7 +167,7 @@ class KnowledgeBuffer:
         """Draws a balanced D_E: n // 2 tuples of each class, with replacement, in random order.
 
         :param n: N_E; an odd number is rounded down
-        :param part: the part of K to draw from, in which both classes must occur
+        :param part: the part of K to draw from
         :param env: normalises the observations, if given
         :param balanced: False draws every tuple with the same probability
         """

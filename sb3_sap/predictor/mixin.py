@@ -129,9 +129,8 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self._steps_of_earlier_learns += self.num_timesteps
-        self._set_label_source(
-            cast(KnowledgeMixin, self.replay_buffer)
-        )  # a copied model's buffer has lost its function
+        # The buffer of a copied model has lost its AP function.
+        self._set_label_source(cast(KnowledgeMixin, self.replay_buffer))
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     @property

@@ -48,8 +48,8 @@ def mountain_car(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     """``MountainCar-v0``: False where the motor did not push along the motion; but to turn is no mistake where the flag
     is within reach.
 
-    The flag is within reach where pushing right from now on gets there: a constant push is a conservative force, so one
-    sum tells. A car that moves left there may push right, which is braking.
+    The flag is within reach where pushing right from now on gets there, which follows from energies: a constant push
+    is a conservative force. A car that moves left there may push right, which is braking.
 
     *Heuristic.* Every step costs 1, and a car that lacks energy gains none by braking or idling. But where it will have
     energy to spare, braking can make a swing shorter by a step or two.

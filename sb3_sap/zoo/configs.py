@@ -62,8 +62,8 @@ def check_file(path: str) -> None:
         if not isinstance(entry, Mapping):
             raise TypeError(f"{path}: the entry {name!r} must hold settings, `key: value`, but is {entry!r}.")
         if str(name).startswith("sap/") and name not in gym.registry:
-            ours = [known for known in gym.registry if known.startswith("sap/")]
-            raise ValueError(f"{path}: the environment {name!r} is unknown: {nearest(name, ours)}")
+            packaged_ids = [known for known in gym.registry if known.startswith("sap/")]
+            raise ValueError(f"{path}: the environment {name!r} is unknown: {nearest(name, packaged_ids)}")
 
 
 def evaluation_options(hyperparams: Mapping[str, Any]) -> dict[str, Any]:

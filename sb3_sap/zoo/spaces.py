@@ -73,8 +73,8 @@ def guided_converter(base: Converter) -> Converter:
 
 
 def _is_own(name: str) -> bool:
-    ours = ("alpha", "t_k", "alpha_low", "actor_permissibility_coef", *(f"{power}_pow" for power in POWERS))
-    return name in ours or name.startswith(PREDICTOR_PREFIX)
+    own = ("alpha", "t_k", "alpha_low", "actor_permissibility_coef", *(f"{power}_pow" for power in POWERS))
+    return name in own or name.startswith(PREDICTOR_PREFIX)
 
 
 def _convert_own(sampled: Params) -> Params:

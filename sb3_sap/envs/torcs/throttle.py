@@ -44,9 +44,8 @@ class SpeedHolder:
     def controls(self, simulation: Physics) -> tuple[float, float, int]:
         """Throttle, brake and gear for the next period."""
         lack = self.speed - simulation.velocity[0] * KMH
-        if (
-            abs(lack) < self.speed / 5
-        ):  # not while it accelerates from rest, which says nothing about the throttle needed
+        # Acceleration from rest says nothing about the throttle that holds the speed.
+        if abs(lack) < self.speed / 5:
             self._integral = min(max(self._integral + INTEGRAL_GAIN * PERIOD * lack, 0.0), 1.0)
         throttle = min(max(GAIN * lack + self._integral, 0.0), 1.0)
         front_right, front_left, rear_right, rear_left = simulation.wheel_spins

@@ -1,4 +1,4 @@
-"""The algorithms: the paper's DDPG-AP and its baselines (section 5.1), and the same for other off-policy bases."""
+"""The paper's DDPG-AP and its baselines (section 5.1), and guided versions of other off-policy algorithms."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from sb3_sap.guidance.constraints import ActionConstraint
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
 
-#: The lane-keeping constraints of section 5.1, by name, because the algorithms import no environment.
+#: Dotted names of the lane-keeping constraints (section 5.1), because the algorithms import no environment.
 CE1 = "sb3_sap.envs.constraint_ce1"
 CE2 = "sb3_sap.envs.constraint_ce2"
 
 
 class DDPG(ConstrainedExplorationMixin, PlainDDPG):
     """SB3's DDPG with the settings of :class:`~sb3_sap.common.settings.SettingsMixin` and
-    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`; without them it equals SB3's to the bit.
+    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`; if none is set, it is bit-identical to SB3's.
     """
 
 
@@ -37,7 +37,7 @@ class DDPGAP(ActionPermissibilityMixin, PlainDDPG):
 
 
 class DDPGCE1(DDPG):
-    """DDPG-CE1: on the left of the centre line never steer further left than before, on the right never right."""
+    """DDPG-CE1: left of the centre line never steer further left than a step before, right of it not further right."""
 
     def __init__(self, *args: Any, constraint: ActionConstraint | str = CE1, **kwargs: Any):
         super().__init__(*args, constraint=constraint, **kwargs)
@@ -80,7 +80,7 @@ class CrossQAP(ActionPermissibilityMixin, CrossQ):
 
 
 class DQNAP(ActionPermissibilityMixin, DQN):
-    """DQN guided by action permissibility: A_st is every action, and the ε-greedy choice is guided, too."""
+    """DQN guided by action permissibility. The candidates A_st are all actions; the ε-greedy action is guided, too."""
 
     stochastic_policy: ClassVar[bool] = True
 
@@ -91,7 +91,7 @@ class QRDQNAP(ActionPermissibilityMixin, QRDQN):
     stochastic_policy: ClassVar[bool] = True
 
 
-#: Every algorithm by its RL Zoo name, for commands, the zoo and its search spaces.
+#: Every algorithm by its RL Zoo name.
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
     "ddpg": DDPG,
     "ddpg_ce1": DDPGCE1,
@@ -113,7 +113,7 @@ def is_guided(algo: str) -> bool:
 
 
 def base_of(algo: str) -> str:
-    """The RL Zoo name of an algorithm's base, such as ``"ddpg"`` for ``"ddpg_ap_ce2"``; of others, the name itself."""
+    """The RL Zoo name of an algorithm's base, such as ``"ddpg"`` of ``"ddpg_ap_ce2"``; for others, their own name."""
     if algo not in ALGORITHMS:
         return algo
     bases = (cls for cls in ALGORITHMS[algo].__mro__ if not cls.__module__.startswith("sb3_sap."))

@@ -61,8 +61,13 @@ def query_labels(
     """Calls a user's function with a batch of actions and checks the labels that it returns.
 
     :param argument: the name of the constructor argument that holds the function, for the error messages
-    :param next_obs: s', where the function takes it
+    :param obs: s, raw, (n, *obs_shape)
+    :param actions: a, in the environment's units, (n, *action_shape)
+    :param next_obs: s', for functions that take it
     :return: (n,) bool
+    :raise RuntimeError: if the function raises an error
+    :raise TypeError: if the labels are not bool
+    :raise ValueError: if their shape is not (n,)
     """
     name = getattr(function, "__name__", repr(function))
     n = len(actions)

@@ -10,7 +10,7 @@ import yaml
 
 from sb3_sap.common.errors import is_number, nearest
 
-#: Keys of RL Zoo's format that are for its runner, not for the algorithm's constructor.
+#: Keys of an RL Zoo configuration that RL Zoo reads itself; all others are arguments of the constructor.
 RUNNER_KEYS = frozenset(
     {
         "callback",
@@ -27,7 +27,7 @@ RUNNER_KEYS = frozenset(
         "vec_env_wrapper",
     }
 )
-#: The paper chooses t_k by the length of the run: up to this many steps, the entry ``<preset>-3k`` applies.
+#: Timesteps up to which the entry ``<preset>-3k`` applies, because the paper chooses t_k by the length of the run.
 SHORT_RUN = 3_000
 #: Entries named like a Gymnasium environment are not presets.
 _ENVIRONMENT = re.compile(r"/|-v\d+$")
@@ -59,12 +59,13 @@ def preset_names(algo: str | type) -> list[str]:
 def preset(name: str, algo: str | type | None = None, steps: int | None = None) -> dict[str, Any]:
     """Constructor arguments: ``TQCAP("MlpPolicy", env, **preset("fast", TQCAP))``.
 
-    :param name: ``"paper"``, the values of section 5.1; ``"fast"``, what learns lane keeping soonest; ``"tuned"``, the
-        best settings of a baseline on lane keeping; or ``"default"``, the constructor's own
-    :param algo: the algorithm, a class of this package, one derived from it, or its RL Zoo name; ``None`` for the
-        paper's preset alone, which is DDPG-AP's
-    :param steps: planned length of the training; None: the preset's own
-    :raise ValueError: for an unknown preset or algorithm, or none
+    :param name: ``"paper"``, the values of section 5.1; ``"fast"``, the settings that learn lane keeping fastest;
+        ``"tuned"``, the best settings of a baseline on lane keeping; or ``"default"``, those of the constructor
+    :param algo: the algorithm, a class of this package, one derived from it, or its RL Zoo name. ``None``: DDPG-AP,
+        for the paper's preset only
+    :param steps: planned timesteps of the training: a short one may have settings of its own. ``None``: a long one
+    :raise TypeError: if ``steps`` is not a number
+    :raise ValueError: if the preset or the algorithm is unknown, or the algorithm is missing
     """
     if algo is None:
         if name != "paper":
@@ -90,7 +91,7 @@ def settings_in(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _zoo_name(algo: str | type) -> str:
-    """The RL Zoo name of an algorithm; a class derived from one of this package's has that one's."""
+    """The RL Zoo name of an algorithm, or of the algorithm of this package that a class is derived from."""
     if not isinstance(algo, type):
         return algo
     from sb3_sap.algorithms import ALGORITHMS  # here, so that commands read presets without loading every algorithm

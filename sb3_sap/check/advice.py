@@ -1,4 +1,4 @@
-"""What the findings about an AP function mean, in words."""
+"""Advice on an AP function, from the findings of a check."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
 
 #: Below this share, or above one minus it, examples of one class are rare.
 RARE = 0.02
-#: Examples of each class that a model wants before E is fitted: the default of ``min_per_class``.
+#: Examples of each class that K must hold before E is fitted: the default of ``min_per_class``.
 MIN_PER_CLASS = 20
 #: Number of changes of the label along one action dimension above which it is hard to learn.
 ROUGH = 4.0
-#: Share of states below which the action decides too rarely for guidance to have a choice.
+#: Share of states where the action decides the label, below which guidance hardly ever has a choice.
 FEW = 0.1
-#: Accuracy below which what a classifier gains from the action, or loses without one of its dimensions, is noise.
+#: Difference in accuracy that is noise, with and without the action; for one action dimension, half of it.
 NOISE = 0.02
-#: Share of a good policy's actions above which their prohibition is serious.
+#: Share of the policy's actions labelled non-permissible above which a good policy contradicts the AP function.
 ALARM = 0.1
 
 
@@ -45,29 +45,29 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
             f"Only {min(rate, 1 - rate):.1%} of random actions are {rarer}: the predictor first sees {MIN_PER_CLASS} "
             f"of them after about {steps:,.0f} steps. Plan for a longer run, or for labels that say more."
         )
-    accuracy, blind, informs = (
+    accuracy, without_action, informs = (
         report.accuracy or 0.0,
         report.accuracy_without_action or 0.0,
         report.action_informs or (),
     )
-    seen = accuracy - blind >= NOISE  # whether the classifier makes use of the action
-    if report.action_matters is not None and report.action_matters < FEW and not seen:
+    uses_action = accuracy - without_action >= NOISE
+    if report.action_matters is not None and report.action_matters < FEW and not uses_action:
         yield (
             f"At {percent(report.action_matters)} of the states that were tried does the label depend on the action: "
             "elsewhere every action has the same label, so that guidance has no choice. Label what the "
             "action itself changed, such as a difference between next_obs and obs, or judge the action by what it does "
             "to a velocity."
         )
-    elif accuracy >= SUFFICIENT_ACCURACY and not seen:
+    elif accuracy >= SUFFICIENT_ACCURACY and not uses_action:
         yield (
-            f"A classifier that does not see the action foresees {blind:.0%} of the labels, and one that sees it "
-            f"{accuracy:.0%}: the state says nearly everything about the label, so the predictor would hardly tell "
-            "one action from another. Label what the action itself changed."
+            f"A classifier that does not see the action foresees {without_action:.0%} of the labels, and one that "
+            f"sees it {accuracy:.0%}: the state says nearly everything about the label, so the predictor would hardly "
+            "tell one action from another. Label what the action itself changed."
         )
-    elif accuracy >= SUFFICIENT_ACCURACY and len(informs) > 1 and (idle := _idle(informs)):
+    elif accuracy >= SUFFICIENT_ACCURACY and len(informs) > 1 and (uninformative := _uninformative(informs)):
         yield (
-            f"The classifier gains less than {NOISE / 2:.0%} from {_names(idle)}. Guidance replaces every dimension of "
-            'an action, these at random, too: candidate_selection="nearest" changes them least.'
+            f"The classifier gains less than {NOISE / 2:.0%} from {_names(uninformative)}. Guidance replaces every "
+            'dimension of an action, these at random, too: candidate_selection="nearest" changes them least.'
         )
     if report.label_changes is not None and report.label_changes > ROUGH:
         yield (
@@ -93,7 +93,7 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
         )
 
 
-def _idle(informs: tuple[float, ...]) -> list[int]:
+def _uninformative(informs: tuple[float, ...]) -> list[int]:
     """The action dimensions without which the classifier loses next to nothing."""
     return [i for i, lost in enumerate(informs) if lost < NOISE / 2]
 

@@ -29,15 +29,15 @@ def check_permissibility(
 ) -> PermissibilityReport:
     """Tries an AP function with random actions and, if one is given, with a good policy.
 
-    The environment is stepped ``n_steps`` times with random actions, as often with the policy, and further to come back
-    to a few states, by a reset with the same seed and the same actions: about 3,500 steps with one action dimension,
-    170 for each action of a ``Discrete`` space, and with several dimensions between 5,000, where the action always
-    decides, and 21,000, where it never does. Short episodes reduce these numbers.
+    The environment is stepped ``n_steps`` times with random actions, and as often with the policy. Further steps return
+    to a few states, by a reset with the same seed and the same actions, to try several actions in each: about 3,500
+    steps with one action dimension, 170 for each action of a ``Discrete`` space, and with several dimensions between
+    5,000, where the action always decides, and 21,000, where it never does. Short episodes reduce these numbers.
 
     :param env: one environment, not a vector of them, with a bounded ``Box`` or a ``Discrete`` action space, and with
         observations that SB3 takes: a ``Box``, ``Discrete``, ``MultiDiscrete``, ``MultiBinary``, or a ``Dict`` of them
     :param ap_function: as the algorithms take it: f(s, a | s') or its dotted name; ``None``: ``info["permissible"]``
-    :param policy: a good one, with SB3's ``predict``, or a function of one observation that returns an action
+    :param policy: a good policy, with SB3's ``predict``, or a function of one observation that returns an action
     :param n_steps: random steps, at least 100
     :param seed: of all random draws
     :param verbose: whether to print the report
@@ -48,24 +48,24 @@ def check_permissibility(
     if not isinstance(env, gym.Env):
         raise TypeError(f"`env` must be a single Gymnasium environment, but is {env!r}.")
     given: list[tuple[str, Any, int]] = [("n_steps", n_steps, 100), ("seed", seed, 0)]
-    for name, value, least in given:
-        if not isinstance(value, Integral) or value < least:
-            raise ValueError(f"`{name}` must be a whole number of at least {least}, but is {value!r}.")
+    for name, value, minimum in given:
+        if not isinstance(value, Integral) or value < minimum:
+            raise ValueError(f"`{name}` must be a whole number of at least {minimum}, but is {value!r}.")
     check_action_space("check_permissibility", env.action_space, discrete=None)
     check_observation_space("check_permissibility", env.observation_space)
     function = None if ap_function is None else resolve(ap_function, "ap_function")
-    act = None if policy is None else _acting(policy, env.action_space)
+    act = None if policy is None else _action_function(policy, env.action_space)
     env.action_space.seed(seed)
-    walk = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)
-    labels = label(walk, function)
+    transitions = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)
+    labels = label(transitions, function)
     action_matters, label_changes = try_actions(env, function, seed)
     foresight = foresee(
-        env, stack_observations([t.obs for t in walk]), np.stack([t.action for t in walk]), labels, seed
+        env, stack_observations([t.obs for t in transitions]), np.stack([t.action for t in transitions]), labels, seed
     )
     findings: dict[str, Any] = {
         "n_steps": n_steps,
         "permissible_rate": float(labels.mean()),
-        "own_row": np.array_equal(label(walk[::-1], function)[::-1], labels),
+        "own_row": np.array_equal(label(transitions[::-1], function)[::-1], labels),
         "action_matters": action_matters,
         "label_changes": label_changes,
         **(dict.fromkeys(Foresight._fields) if foresight is None else foresight._asdict()),
@@ -80,7 +80,7 @@ def check_permissibility(
     return report
 
 
-def _acting(policy: Any, space: gym.Space[Any]) -> Callable[[Any], Any]:
+def _action_function(policy: Any, space: gym.Space[Any]) -> Callable[[Any], Any]:
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(f"`policy` must have SB3's `predict` or be a function (obs) -> action, but is {policy!r}.")
 

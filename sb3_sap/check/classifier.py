@@ -15,11 +15,11 @@ from sb3_sap.common.arrays import BoolArray, Observations
 from sb3_sap.predictor.knowledge import KnowledgeBuffer, LabelledActions
 from sb3_sap.predictor.network import PermissibilityPredictor
 
-#: Of the random transitions, the share that is never trained on; the fits of the classifier, and the examples of each.
+#: Share of the random transitions that is held out, number of fits of the classifier, and examples in each fit.
 HELD_OUT, FITS, DATASET_SIZE = 0.2, 120, 512
-#: Examples of each class that there must be, in training and held out.
+#: Minimum number of examples of each class, for training and held out.
 MIN_EXAMPLES = 10
-#: Shuffles over which the loss of accuracy of an action dimension is averaged.
+#: Shuffles of an action dimension over which the loss of accuracy is averaged.
 N_SHUFFLES = 5
 
 
@@ -36,21 +36,23 @@ class FlattenEntries(BaseFeaturesExtractor):
 class Foresight(NamedTuple):
     """Balanced accuracies on examples that were never trained on."""
 
+    #: Of a classifier that sees observation and action.
     accuracy: float
+    #: Of one that is trained and tested with every action set to zero.
     accuracy_without_action: float
-    """Of the same classifier, to which every action is zero."""
+    #: For each action dimension, the accuracy that the first loses when it is shuffled among the examples.
     action_informs: tuple[float, ...]
-    """Accuracy that is lost when one dimension of the action is shuffled among the examples."""
 
 
 def foresee(
     env: gym.Env[Any, Any], obs: Observations, actions: np.ndarray[Any, Any], labels: BoolArray, seed: int
 ) -> Foresight | None:
-    """Fits E as a model does, on a part of the examples, and measures it on the others; None: a class is too rare.
+    """Fits E, as a guided model does, on a part of the examples and measures its accuracy on the others.
 
     :param obs: (n, *obs_shape), raw
     :param actions: (n, *action_shape), in the environment's units
     :param labels: (n,)
+    :return: ``None`` if one of the classes is too rare
     """
     space: Any = env.action_space
     n = len(labels)
@@ -61,16 +63,16 @@ def foresee(
     knowledge.add(obs, actions, labels)
     if min(min(knowledge.counts("train")), min(knowledge.counts("validation"))) < MIN_EXAMPLES:
         return None
-    sighted, blind = _classifier(env, seed), _classifier(env, seed, fused=True)
+    full, blind = _classifier(env, seed), _classifier(env, seed, fused=True)
     for _ in range(FITS):
         examples = knowledge.sample(DATASET_SIZE)
-        sighted.fit(examples)
+        full.fit(examples)
         blind.fit(_without_action(examples))
     held_out = knowledge.sample(n, "validation")
-    accuracy = _accuracy(sighted, held_out)
+    accuracy = _accuracy(full, held_out)
     rng = np.random.default_rng(seed)
     informs = tuple(
-        accuracy - float(np.mean([_accuracy(sighted, _shuffled(held_out, i, rng)) for _ in range(N_SHUFFLES)]))
+        accuracy - float(np.mean([_accuracy(full, _shuffled(held_out, i, rng)) for _ in range(N_SHUFFLES)]))
         for i in range(actions.shape[1])
     )
     return Foresight(accuracy, _accuracy(blind, _without_action(held_out)), informs)

@@ -14,30 +14,30 @@ LISTED = 8
 class PermissibilityReport:
     """What :func:`check_permissibility` found. ``None`` stands for what could not be measured."""
 
+    #: Random steps.
     n_steps: int
-    """Random steps."""
+    #: Share of random actions that are labelled permissible.
     permissible_rate: float
-    """Share of random actions that are labelled permissible."""
+    #: Whether each label depends on its own transition alone, and is the same in a second call.
     own_row: bool
-    """Whether each label depends on its own transition alone, and is the same in a second call."""
+    #: Share of fixed states at which some of the actions are permissible and others are not; with several dimensions
+    #: they are tried together. ``None``: the environment cannot be brought back to a state.
     action_matters: float | None
-    """Share of fixed states at which some of the actions are permissible and others are not; with several dimensions
-    they are tried together. ``None``: the environment cannot be brought back to a state."""
+    #: Mean number of changes of the label along a sweep of one action dimension, at the states where it changes at all:
+    #: 1 is a threshold, 2 an interval. ``None`` for discrete actions, too, which have no order.
     label_changes: float | None
-    """Mean number of changes of the label along a sweep of one action dimension, at the states where it changes at all:
-    1 is a threshold, 2 an interval. ``None`` for discrete actions, too, which have no order."""
+    #: Balanced accuracy of a quick classifier on held-out random transitions. ``None``: one of the classes is too
+    #: rare.
     accuracy: float | None
-    """Balanced accuracy of a quick classifier on held-out random transitions. ``None``: one of the classes is too
-    rare."""
+    #: The same of a classifier that does not see the action; where it is no lower, the action decides nothing.
     accuracy_without_action: float | None
-    """The same of a classifier that does not see the action; where it is no lower, the action decides nothing."""
+    #: For each dimension of the flattened action, the accuracy that the classifier loses when it is shuffled among
+    #: the held-out transitions; about 0 where it says nothing about the label.
     action_informs: tuple[float, ...] | None
-    """For each dimension of the flattened action, the accuracy that the classifier loses when it is shuffled among
-    the held-out transitions; about 0 where it says nothing about the label."""
+    #: Share of the policy's own actions that are labelled non-permissible; by Definition 3 zero for a good policy.
     policy_forbidden: float | None
-    """Share of the policy's own actions that are labelled non-permissible; by Definition 3 zero for a good policy."""
+    #: What to look into, a sentence each; empty if no problems were found.
     advice: tuple[str, ...] = field(default=())
-    """What to look into, a sentence each; empty if no problems were found."""
 
     def __str__(self) -> str:
         return _described(self)

@@ -12,13 +12,13 @@ from gymnasium import spaces
 from sb3_sap.common.arrays import BoolArray, copy_observation, same_observation, stack_observations
 from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
 
-#: States at which actions are tried: for one action dimension or discrete actions, and for several dimensions.
+#: Number of states in which actions are tried: with one action dimension or discrete actions, and with several.
 N_STATES, N_STATES_SEVERAL = 16, 24
-#: Each of them is fewer random steps than this after a reset.
+#: Each of these states is reached by fewer random steps than this after a reset.
 MAX_PREFIX = 20
 #: Actions of one sweep along a dimension, from the lowest to the highest.
 N_ACTIONS = 21
-#: Random actions, of all dimensions at once, with which a state is tried where a sweep did not change the label.
+#: Random actions, in all dimensions at once, that are tried in a state where the sweep did not change the label.
 N_JOINT = 64
 
 
@@ -33,15 +33,15 @@ class Transition(NamedTuple):
 
 def rollout(env: gym.Env[Any, Any], act: Callable[[Any], Any], n_steps: int, seed: int) -> list[Transition]:
     """Steps through an environment, from episode to episode, with the actions that ``act`` chooses."""
-    walk: list[Transition] = []
+    transitions: list[Transition] = []
     obs = _reset(env, seed)
-    while len(walk) < n_steps:
+    while len(transitions) < n_steps:
         obs = copy_observation(obs)
         action = act(obs)
         next_obs, ended, info = _step(env, action)
-        walk.append(Transition(obs, action, copy_observation(next_obs), info))
+        transitions.append(Transition(obs, action, copy_observation(next_obs), info))
         obs = _reset(env, None) if ended else next_obs
-    return walk
+    return transitions
 
 
 def label(transitions: list[Transition], function: APFunction | None) -> BoolArray:
@@ -56,7 +56,7 @@ def label(transitions: list[Transition], function: APFunction | None) -> BoolArr
 
 
 def try_actions(env: gym.Env[Any, Any], function: APFunction | None, seed: int) -> tuple[float | None, float | None]:
-    """How the label depends on the action alone: ``action_matters`` and ``label_changes`` of the report."""
+    """How the label depends on the action in a fixed state: ``action_matters`` and ``label_changes`` of the report."""
     space, rng = env.action_space, np.random.default_rng(seed)
     several = isinstance(space, spaces.Box) and space.low.size > 1
     decides, changes = [], []
@@ -69,7 +69,7 @@ def try_actions(env: gym.Env[Any, Any], function: APFunction | None, seed: int) 
                 return None, None
         labels = label(sweep, function)
         changes.append(int(np.count_nonzero(np.diff(labels))))
-        # One dimension alone rarely changes a label that depends on several.
+        # A sweep of one dimension rarely changes a label that depends on several.
         decides.append(
             changes[-1] > 0
             or (
@@ -90,9 +90,9 @@ def _sweep_actions(space: Any, rng: np.random.Generator) -> np.ndarray[Any, Any]
     if isinstance(space, spaces.Discrete):
         return np.arange(space.n)
     actions = np.repeat(np.asarray(rng.uniform(space.low, space.high))[None], N_ACTIONS, axis=0)
-    column = actions.reshape(N_ACTIONS, -1)
-    dimension = rng.integers(column.shape[1])
-    column[:, dimension] = np.linspace(space.low.flat[dimension], space.high.flat[dimension], N_ACTIONS)
+    flat = actions.reshape(N_ACTIONS, -1)
+    dimension = rng.integers(flat.shape[1])
+    flat[:, dimension] = np.linspace(space.low.flat[dimension], space.high.flat[dimension], N_ACTIONS)
     return actions.astype(space.dtype)
 
 
@@ -101,7 +101,7 @@ def _step_from(env: gym.Env[Any, Any], seed: int, prefix: list[Any], action: Any
     obs = _reset(env, seed)
     for earlier in prefix:
         reached, ended, _ = _step(env, earlier)
-        if ended:  # sooner than meant: what was reached before would be another state
+        if ended:  # the episode is over: the action is tried in its first state instead
             obs = _reset(env, seed)
             break
         obs = reached

@@ -1,4 +1,4 @@
-"""An animation of a policy that drives, with the predictor's verdict on every steering angle."""
+"""An animation of a driving policy, with E's probability that each steering angle is permissible."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from sb3_sap.envs import CarState
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.evaluation.predictor_plots import permissible_probability
 
-#: Control steps shown in the animation (30 s of driving), and pictures per second: twice real time.
+#: Control steps of the animation (30 s of driving), and its pictures per second (twice real time).
 ANIMATION_STEPS = 150
 ANIMATION_FPS = 10
-#: Steering angles of the fan that shows E's verdict.
+#: Number of steering angles of the fan that shows E's probabilities.
 FAN_ANGLES = 31
 
 
 def animate(policy: Any, simulator: str, speed: float, path: Path, console: Console, track: str = "g-track-3") -> None:
     """Writes a short animation of the policy on a track that it has never seen.
 
-    Each picture shows a state, what the actor is about to do there, and E's verdict on every steering angle.
+    Each picture shows a state, what the actor is about to do there, and E's probability for each steering angle.
     """
     from sb3_sap.envs.viewer import Viewer
 

@@ -40,7 +40,7 @@ from huggingface_sb3 import load_from_hub
 from sb3_sap import {class_name}
 
 model = {class_name}.load(load_from_hub("{repo_id}", "{filename}"))"""
-#: The model learned on normalised observations: both files, and the environment that gives it such observations.
+#: For a model that learned on normalised observations: loads both files and makes the environment.
 USE_NORMALISED = """\
 from huggingface_sb3 import load_from_hub
 from sb3_sap import {class_name}
@@ -54,5 +54,5 @@ model = {class_name}.load(load_from_hub("{repo_id}", "{filename}"), env=env)"""
 
 
 def env_arguments(env_id: str, env_kwargs: Mapping[str, Any]) -> str:
-    """What makes the environment, as Python."""
+    """The arguments of `make_env`, as Python."""
     return ", ".join([f'"{env_id}"', *(f"{name}={value!r}" for name, value in env_kwargs.items())])

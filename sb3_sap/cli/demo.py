@@ -27,13 +27,13 @@ from sb3_sap.evaluation.laps import ENVIRONMENTS, LapResult, write_results
 from sb3_sap.evaluation.plots import save
 from sb3_sap.presets import preset, preset_names
 
-#: km/h, the default speed of the task.
+#: Speed of the car, km/h (the default of the task).
 SPEED = 50.0
 
 
 @dataclass
 class Run:
-    """What to train, where, and where to leave the results."""
+    """Settings of a demonstration."""
 
     algo: str = "ddpg_ap"
     preset: str | None = None  # "fast" where there is one, else "default"
@@ -90,7 +90,7 @@ def demo(run: Run, console: Console) -> list[LapResult]:
 
 
 def draw(run: Run, model: Any, training: pd.DataFrame) -> None:
-    """Draws the learning curve and, where there is a fitted predictor, what it believes."""
+    """Draws the learning curve and, where there is a fitted predictor, its probabilities."""
     title = f"{type(model).__name__} on {TRACKS.get(run.track, run.track)}, seed {run.seed}"
     save(learning_curve(training, title, getattr(model, "noise_steps", None)), run.out / "learning_curve.png")
     predictor = getattr(model, "predictor", None)

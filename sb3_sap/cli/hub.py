@@ -1,4 +1,4 @@
-"""A trained model on the Hugging Face Hub, with a card that says how it was made and how well it does."""
+"""A trained model on the Hugging Face Hub, with a card of its training command and its results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.evaluation.normalisation import FILE_NAME, NormalisedPolicy, add_vecnormalize
 from sb3_sap.evaluation.policies import load_policy
 
-#: What `sb3-sap demo` leaves besides the model, as far as it goes to the Hub.
+#: Files of `sb3-sap demo`, besides the model, that are uploaded.
 EXTRAS = ("lap.gif", "learning_curve.png", "predictor.png", "evaluation.json", "training.csv")
 
 
@@ -74,7 +74,7 @@ def find_trained(
 
 
 def _zoo_run(folder: Path) -> dict[str, Any]:
-    """What RL Zoo's training says of itself in `ENV_ID/`: model, algo, env and its options, command; or nothing."""
+    """Model, algo, env, its options and command, which RL Zoo saved in `ENV_ID/`; empty if it saved none."""
     found = next(folder.glob("*/command.txt"), None)
     if found is None:
         return {}
@@ -97,18 +97,18 @@ def _zoo_run(folder: Path) -> dict[str, Any]:
 
 
 def _zoo_env_kwargs(folder: Path) -> dict[str, Any]:
-    """Options of the environment that the run's entry or command line gave, but for the laps."""
+    """Options of the environment from the run's entry or command line, except the laps."""
     saved: dict[str, Any] = {}
     for name in ("config.yml", "args.yml"):  # RL Zoo's own files, with Python objects in them
-        told = dict(yaml.unsafe_load((folder / name).read_text(encoding="utf-8"))).get("env_kwargs")
-        saved = saved if told is None else dict(told)
+        options = dict(yaml.unsafe_load((folder / name).read_text(encoding="utf-8"))).get("env_kwargs")
+        saved = saved if options is None else dict(options)
     return {name: value for name, value in saved.items() if name != "laps"}
 
 
 def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) -> list[Path]:
     """Writes what will be uploaded into a folder, the model card last, and returns the files.
 
-    :param n_episodes: to evaluate where the run saved no laps
+    :param n_episodes: episodes to evaluate where the run saved no laps
     """
     import stable_baselines3
     from huggingface_hub import EvalResult, ModelCard, ModelCardData
@@ -147,12 +147,12 @@ def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) 
             )
         ],
     )
-    shown = [name for name in EXTRAS[:3] if folder / name in files]
+    pictures = [name for name in EXTRAS[:3] if folder / name in files]
     text = CARD.format(
         algo=trained.algo,
         env_id=trained.env_id,
         class_name=class_name,
-        pictures="".join(f"\n\n![{Path(name).stem.replace('_', ' ')}]({name})" for name in shown),
+        pictures="".join(f"\n\n![{Path(name).stem.replace('_', ' ')}]({name})" for name in pictures),
         results=results,
         use=use.format(
             class_name=class_name,
@@ -206,12 +206,14 @@ def add_push_to_hub(commands: argparse._SubParsersAction[argparse.ArgumentParser
     command.add_argument("path", type=Path, help="the output folder of `sb3-sap demo` or `train`, or a model's .zip")
     command.add_argument("--repo-id", required=True, help="repository on the Hub, such as YOU/ddpg_ap-LaneKeeping")
     command.add_argument("--algo", help="the algorithm, where the folder does not say it")
-    command.add_argument("--env", help="the environment's id, the same")
-    command.add_argument("--command", help="the command that trained the model, the same")
-    command.add_argument("--episodes", type=positive, default=10, help="to evaluate where there are no laps (10)")
+    command.add_argument("--env", help="the environment's id, where the folder does not say it")
+    command.add_argument("--command", help="the command that trained the model, where the folder does not say it")
+    command.add_argument(
+        "--episodes", type=positive, default=10, help="episodes to evaluate where the run saved no laps (10)"
+    )
     add_vecnormalize(command)
-    command.add_argument("--out", type=Path, help="where to write what is uploaded; `hub` beside the model")
-    command.add_argument("--dry-run", action="store_true", help="write it, and upload nothing")
+    command.add_argument("--out", type=Path, help="folder of the files to upload; by default `hub` beside the model")
+    command.add_argument("--dry-run", action="store_true", help="write the files without uploading them")
     command.set_defaults(run=_push_to_hub)
 
 

@@ -26,7 +26,7 @@ def drive_tracks(policy: Any, tracks: list[str], simulator: str, console: Consol
 
 
 def results_table(results: list[LapResult], algo: str | None = None, steps: int = 3_000) -> Table:
-    """The results as the paper's Table 2 shows them, beside its own row of the same algorithm where there is one."""
+    """The results in the form of the paper's Table 2, beside its row of the same algorithm where there is one."""
     paper = TABLE_2.get(steps, TABLE_2[3_000]).get(algo or "", {})
     title = "One lap of each track, the actor alone"
     if paper:

@@ -20,7 +20,7 @@ from sb3_sap.common.command_line import run_command
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs a command and returns its exit code; an error of the user becomes one sentence."""
+    """Runs a command and returns its exit code; an expected error is printed as one sentence."""
     arguments = sys.argv[1:] if arguments is None else arguments
     # Networks this small run no faster on two threads, and one thread always adds in the same order.
     th.set_num_threads(1)

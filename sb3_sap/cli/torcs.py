@@ -10,8 +10,8 @@ from rich.console import Console
 
 from sb3_sap.common.files import atomic_path
 
+#: Time driven by ``check``, s.
 CHECK_SECONDS = 5.0
-"""s of driving in ``check``."""
 
 
 def add_torcs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,7 +19,7 @@ def add_torcs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     torcs = commands.add_parser("torcs", help="install, check and verify TORCS, the reference simulator")
     actions = torcs.add_subparsers(title="commands", required=True, metavar="COMMAND")
     command = actions.add_parser("install", help="fetch Debian's packages and keep the 3 MB that are needed; no root")
-    command.add_argument("--root", type=Path, help="where to put it; then set TORCS_ROOT to it")
+    command.add_argument("--root", type=Path, help="folder to install into; set TORCS_ROOT to it afterwards")
     command.set_defaults(run=_install)
     command = actions.add_parser("check", help="say which TORCS is found, and drive it for 5 seconds")
     command.set_defaults(run=_check)
@@ -30,7 +30,7 @@ def add_torcs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     command.add_argument("trace", type=Path, help="NAME.csv.gz")
     command.add_argument("--start", type=Path, required=True, help="JSON of start conditions, with an entry NAME")
-    command.add_argument("--json", type=Path, help="where to write the comparison")
+    command.add_argument("--json", type=Path, help="file of the comparison")
     command.set_defaults(run=_replay)
 
 

@@ -1,4 +1,4 @@
-"""A table of a training run, one row for each step, that Ctrl-C does not lose."""
+"""A table of a training run, with one row for each step, which survives Ctrl-C."""
 
 from __future__ import annotations
 

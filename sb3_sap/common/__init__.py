@@ -1,1 +1,1 @@
-"""What every other package here builds on; it knows neither predictor nor guidance."""
+"""Settings, checks and helpers for all other packages; nothing here imports the predictor or the guidance."""

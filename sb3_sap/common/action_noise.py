@@ -1,4 +1,4 @@
-"""Action noise, described as YAML can hold it."""
+"""Action noise from a description that YAML can hold."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
+#: Classes of noise by the ``"type"`` in a description.
 NOISES: dict[str, Callable[..., ActionNoise]] = {
     "normal": NormalActionNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise,
@@ -16,7 +17,10 @@ NOISES: dict[str, Callable[..., ActionNoise]] = {
 
 
 def make_action_noise(description: Mapping[str, Any], action_space: spaces.Space[Any]) -> ActionNoise:
-    """Builds the noise that a mapping describes, with the dimension of the action space."""
+    """Builds the noise that a mapping describes, with the shape of the action space.
+
+    :raise ValueError: for an unknown type, a missing ``"sigma"`` or a wrong setting
+    """
     settings = dict(description)
     kind = settings.pop("type", None)
     if kind not in NOISES:

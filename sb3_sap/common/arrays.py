@@ -26,7 +26,7 @@ def same_observation(one: Any, other: Any) -> bool:
 
 
 def rows_of(obs: Any, rows: Any) -> Any:
-    """Some rows of a batch of observations, or one."""
+    """The given rows of a batch of observations; for an integer, a single observation."""
     return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]
 
 

@@ -1,4 +1,4 @@
-"""The training environment: whether its spaces and wrappers can be used, and what it observed itself."""
+"""Checks of the training environment's spaces and wrappers, and its raw observations."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sb3_sap.common.vec_envs import channels_last, check_wrappers, environment_l
 
 
 class EnvironmentMixin(BaseAlgorithm):
-    """Goes before an SB3 off-policy algorithm in the bases of a class."""
+    """Checks the environment. Goes before an SB3 off-policy algorithm in the bases of a class."""
 
     #: Whether the algorithm is for discrete actions; inferred for SB3's and sb3-contrib's bases.
     discrete: ClassVar[bool] = False
 
     def __init__(self, policy: Any, env: Any, *args: Any, **kwargs: Any):
-        #: The images that the environment returns channels last; the user's functions get them in that layout.
+        #: Keys of the images that the environment returns channels last, as the user's functions get them.
         self.images: tuple[str, ...] = ()
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))

@@ -1,4 +1,4 @@
-"""Checks of what a user gave, and sentences that say what was wrong."""
+"""Checks of the user's arguments, and the wording of their errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def nearest(value: object, known: Iterable[str], n: int = 1, cutoff: float = 0.6
 
 
 def check_at_least(model: Any, **minima: int) -> None:
-    """Refuses settings of a model that are no whole numbers, or too small."""
+    """Raises a ``ValueError`` for a setting of a model that is not a whole number or is below its minimum."""
     for name, minimum in minima.items():
         value = getattr(model, name)
         if not isinstance(value, Integral) or value < minimum:

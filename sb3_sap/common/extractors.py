@@ -15,10 +15,10 @@ from sb3_sap.common.functions import resolve
 
 
 class RescaleExtractor(FlattenExtractor):
-    """A flat observation with each bounded entry brought to [-1, 1]; E takes it over from the policy.
+    """Flattens the observation and scales each bounded entry to [-1, 1]; by default E uses it as the policy does.
 
-    SB3's networks get a bounded observation unscaled. Where one entry spans a small fraction of the range of another,
-    such as the velocity of MountainCar, they hardly distinguish its values, and an actor saturates before it learns to.
+    SB3 does not scale bounded observations. If the range of one entry is a small fraction of another's, as that of
+    MountainCar's velocity, networks hardly distinguish its values, and the actor saturates before it learns to.
     The AP function and the user's other functions still get the observation itself.
 
     ``policy_kwargs={"features_extractor_class": RescaleExtractor}``, in YAML ``sb3_sap.RescaleExtractor``.
@@ -36,7 +36,7 @@ class RescaleExtractor(FlattenExtractor):
                 "`features_extractor_class` out, or wrap the environment."
             )
         super().__init__(observation_space)
-        # In single precision "bounds" of ±3e38, which stand for none, are infinitely far apart.
+        # Bounds of ±3e38 stand for no bounds: in single precision their difference is infinite.
         with np.errstate(over="ignore", invalid="ignore"):
             low, high = (bound.astype(np.float32) for bound in (observation_space.low, observation_space.high))
             half, middle = (high - low) / 2, (high + low) / 2
@@ -49,7 +49,7 @@ class RescaleExtractor(FlattenExtractor):
 
 
 def with_extractor(policy_kwargs: Any) -> dict[str, Any]:
-    """A copy of ``policy_kwargs`` in which a features extractor may be named, as in YAML."""
+    """A copy of ``policy_kwargs`` in which the dotted name of a features extractor is replaced by the class."""
     if policy_kwargs is not None and not isinstance(policy_kwargs, Mapping):
         raise TypeError(f"`policy_kwargs` and `predictor_kwargs` must be dictionaries, but one is {policy_kwargs!r}.")
     arguments = dict(policy_kwargs or {})

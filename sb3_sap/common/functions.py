@@ -1,4 +1,4 @@
-"""Functions that a user gives: by dotted name, and whether a saved model can hold them."""
+"""User functions: importing them by their dotted names, and whether a saved model can hold them."""
 
 from __future__ import annotations
 

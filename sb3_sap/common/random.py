@@ -1,4 +1,4 @@
-"""Separate random generators, so that guidance never shifts those that SB3 draws from."""
+"""Separate random generators, so that guidance draws nothing from the generators of SB3."""
 
 from __future__ import annotations
 

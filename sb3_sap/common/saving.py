@@ -1,4 +1,4 @@
-"""Saving and loading: what a file cannot hold, what it cannot be given, and what is wrong with it, in a sentence."""
+"""Saving and loading: functions that no file can hold, settings that cannot change, errors for unusable files."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_sap.common.functions import can_be_pickled
 
-#: Arguments that are functions of the user's.
+#: Arguments of the constructor that hold user functions.
 FUNCTIONS = ("ap_function", "constraint", "permissible_actions")
-#: Settings of SB3's whose effect a saved file holds, in a built network or the state of an optimizer.
+#: SB3's settings that `load` cannot change, because the file holds a network or an optimizer's state built with them.
 HELD = ("ent_coef", "use_sde")
 
 
 class SavingMixin(BaseAlgorithm):
-    """Goes before an SB3 algorithm in the bases of a class."""
+    """Checks what is saved and loaded. Goes before an SB3 algorithm in the bases of a class."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         self._held: dict[str, Any] = {}
@@ -62,7 +62,7 @@ class SavingMixin(BaseAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> Self:
-        """SB3's ``load``, which reports a truncated file in a sentence, and applies a new ``seed``."""
+        """SB3's ``load``, with a clear error for an unusable file; a ``seed`` among ``kwargs`` is applied."""
         known = inspect.signature(cls).parameters
         for name in kwargs.keys() - known.keys():
             if near := difflib.get_close_matches(name, known, n=1, cutoff=0.75):

@@ -1,4 +1,4 @@
-"""Settings of the paper that SB3's constructors lack, and settings written as YAML can hold them."""
+"""Settings of the paper that SB3's constructors lack, and SB3's settings in the form that YAML can hold."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ PAPER_STEPS = 15_000
 class SettingsMixin(EnvironmentMixin, SavingMixin, OffPolicyAlgorithm):
     """Goes before an SB3 off-policy algorithm in the bases of a class.
 
-    :param actor_learning_rate: of the actor alone, a number or an SB3 schedule; the paper's actor learns ten times
-        slower than its critic (section 5.1). ``None``: ``learning_rate``. A schedule may be written as in YAML:
+    :param actor_learning_rate: learning rate of the actor, a number or an SB3 schedule; the paper's is a tenth of the
+        critic's (section 5.1). ``None``: ``learning_rate``. A schedule may be written as in YAML:
         ``"lin_0.001"`` falls linearly from 0.001 to 0 over the training
     :param action_noise: besides an SB3 ``ActionNoise``, its description as YAML can write it:
         ``{"type": "normal", "sigma": 0.1}`` or ``{"type": "ornstein-uhlenbeck", "sigma": 0.3, "theta": 0.6, "dt": 1}``
@@ -46,7 +46,7 @@ class SettingsMixin(EnvironmentMixin, SavingMixin, OffPolicyAlgorithm):
         **kwargs: Any,
     ):
         self.actor_learning_rate: Any = actor_learning_rate
-        # SB3 writes into these dictionaries.
+        # Copies, because SB3 writes into these dictionaries.
         kwargs["replay_buffer_kwargs"] = dict(kwargs.get("replay_buffer_kwargs") or {})
         kwargs["policy_kwargs"] = with_extractor(kwargs.get("policy_kwargs"))
         super().__init__(policy, env, *args, **kwargs)
@@ -70,7 +70,7 @@ class SettingsMixin(EnvironmentMixin, SavingMixin, OffPolicyAlgorithm):
                 f'{{"type": "normal", "sigma": 0.1}}, but is {action_noise!r}.'
             )
         elif isinstance(action_noise, VectorizedActionNoise) and action_noise.n_envs != self.n_envs:
-            # Saved with other environments: SB3 makes one for these when it learns.
+            # The model was saved with another number of environments: SB3 wraps the noise anew when it learns.
             self.action_noise = action_noise.base_noise
         super()._setup_model()
         if self.discrete and self.actor_learning_rate is not None:

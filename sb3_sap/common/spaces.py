@@ -1,4 +1,4 @@
-"""Which spaces the algorithms can use; others are refused in one sentence, where SB3 would go wrong or fail later."""
+"""Checks of action and observation spaces, with a clear error where SB3 would go wrong or fail later."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-#: Scaled actions that must survive scaling and back, and the tolerance.
+#: Scaled actions that must be the same after unscaling and scaling, and the tolerance.
 PROBES, TOLERANCE = np.linspace(-1, 1, 9), 1e-3
-#: Observations, and entries of a ``Dict`` of them, for which SB3 has networks.
+#: Observation spaces, alone or as entries of a ``Dict``, for which SB3 has networks.
 OBSERVATIONS = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool | None) -> None:
-    """Refuses an action space that the algorithm cannot use.
+    """Checks that an algorithm can use an action space.
 
     :param algorithm: its name, for the error message
-    :param discrete: whether it needs a ``Discrete`` space, or a ``Box``; None: it takes either
-    :raise ValueError: with one sentence
+    :param discrete: whether it needs a ``Discrete`` space, else a ``Box``; ``None``: it takes either
+    :raise ValueError: if the algorithm cannot use the space
     """
     kinds = {True: "discrete (Discrete)", False: "continuous (Box)", None: "bounded Box or a Discrete"}
     wanted = {True: (spaces.Discrete,), False: (spaces.Box,), None: (spaces.Box, spaces.Discrete)}
@@ -72,7 +72,7 @@ def _check_box(algorithm: str, space: spaces.Box) -> None:
         actions = space.low + 0.5 * (probes + 1.0) * (space.high - space.low)
         back = 2.0 * ((actions - space.low) / (space.high - space.low)) - 1.0
         exact = np.abs(back - probes) <= TOLERANCE
-    if not exact.all():  # what overflows is no number, and no number is within the tolerance
+    if not exact.all():  # an overflow gives inf or NaN, which is not within the tolerance
         raise ValueError(
             f"{needs} can be scaled to [-1, 1] and back, but the bounds of {space} are too large or too close "
             f"together for {space.dtype}: let the environment take actions from -1 to 1 and rescale them itself."
@@ -80,10 +80,10 @@ def _check_box(algorithm: str, space: spaces.Box) -> None:
 
 
 def check_observation_space(algorithm: str, space: spaces.Space[Any], key: str = "") -> None:
-    """Refuses observations that SB3 cannot use, or would misread.
+    """Checks that SB3 can use the observations and does not misread them.
 
     :param algorithm: its name, for the error message
-    :raise ValueError: with one sentence
+    :raise ValueError: if the algorithm cannot use the space
     """
     where = f"the entry {key!r} of its observation space" if key else "its observation space"
     if isinstance(space, spaces.Dict) and not key:

@@ -12,7 +12,7 @@ import torch as th
 def own_generators(seed: int, device: th.device) -> Iterator[None]:
     """Seeds torch's global generators, of the CPU and of ``device``, within the block, and restores them after it.
 
-    What draws inside, such as the initial weights of a network or dropout, shifts no generator of the base algorithm.
+    Random draws inside, such as those of initial weights or of dropout, shift no generator of the base algorithm.
     """
     cuda = device.type == "cuda"
     with th.random.fork_rng(devices=[device] if cuda else []):
@@ -27,14 +27,14 @@ def own_generators(seed: int, device: th.device) -> Iterator[None]:
 def flush_denormals() -> Iterator[None]:
     """Rounds numbers below 1e-38 to zero within the block.
 
-    Weight decay and Adam shrink what belongs to inactive units towards zero for ever, and processors compute with
-    denormal numbers so slowly that a fit takes seven times as long after 1,000 steps. The setting of the caller,
-    whose own networks must not change by a bit, is kept. It holds for the calling thread alone, so that the gain
-    needs one thread for each process, as in ``OMP_NUM_THREADS=1``.
+    Weight decay and Adam shrink the weights and moments of inactive units towards zero for ever. Processors are slow
+    with denormal numbers: after 1,000 steps a fit would take seven times as long. The caller's setting is restored,
+    because the base algorithm's results must not change by a bit. The setting is one of the calling thread, so that
+    the gain needs one thread per process, as with ``OMP_NUM_THREADS=1``.
     """
-    already = (th.tensor(1e-310, dtype=th.float64) * 1.0).item() == 0.0
+    before = (th.tensor(1e-310, dtype=th.float64) * 1.0).item() == 0.0
     th.set_flush_denormal(True)
     try:
         yield
     finally:
-        th.set_flush_denormal(already)
+        th.set_flush_denormal(before)

@@ -1,4 +1,4 @@
-"""What an environment itself observed, read through SB3's wrappers of vectorised environments."""
+"""Raw observations of an environment, read through SB3's wrappers of vectorised environments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper,
 
 from sb3_sap.common.arrays import same_observation
 
-#: In a step's ``info``: an episode's last observation as it was before VecNormalize.
+#: Key of ``info`` for an episode's last observation as it was before VecNormalize.
 RAW_LAST = "sap_raw_terminal_observation"
 
 
@@ -30,9 +30,9 @@ def unwrapped(env: VecEnv) -> VecEnv:
 
 
 def check_wrappers(env: VecEnv) -> None:
-    """Refuses wrappers in an order for which SB3's off-policy algorithms confuse normalised and raw observations.
+    """Checks the order of wrappers, for some of which SB3's algorithms confuse normalised and raw observations.
 
-    :raise ValueError: with one sentence
+    :raise ValueError: for such an order
     """
     above: list[VecEnvWrapper] = []
     normalising = 0
@@ -55,7 +55,7 @@ def check_wrappers(env: VecEnv) -> None:
 
 
 def never_updated(normalize: VecNormalize) -> bool:
-    """Whether the statistics of observations are still the initial ones."""
+    """Whether the statistics of observations were never updated."""
     statistics = normalize.obs_rms if isinstance(normalize.obs_rms, dict) else {"": normalize.obs_rms}
     return all(one.count < 1 for one in statistics.values())
 
@@ -134,11 +134,11 @@ def _identities(env: object) -> set[int]:
 
 @contextmanager
 def watched_steps(env: VecEnv, normalize: VecNormalize | None) -> Iterator[list[int]]:
-    """Follows the steps of a vectorised environment within a ``with`` block.
+    """Counts the steps and resets of a vectorised environment within a ``with`` block.
 
-    Puts each episode's last observation, as it was before VecNormalize, into ``info``; SB3 would invert the
-    normalisation of a rounded and clipped one. Nothing is added to the wrappers, because SB3 compares them with those
-    of evaluation environments.
+    It also puts each episode's last observation, as it was before VecNormalize, into ``info``; SB3 would recover it
+    from a rounded and clipped one. Methods are replaced and no wrapper is added, because SB3 compares the wrappers
+    with those of evaluation environments.
 
     :param env: the model's
     :param normalize: its VecNormalize, if there is one

@@ -1,4 +1,4 @@
-"""Watches the training environment: its own observations, foreign steps, and whether it normalises as before."""
+"""Watches the training environment: raw last observations, steps by other code, and its normalisation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_sap.common.vec_envs import is_at, never_updated, shares_environment, wa
 
 
 class WatchedEnvironmentMixin(SettingsMixin):
-    """Gives the buffers each episode's last observation as it was, and warns of what would corrupt them unnoticed."""
+    """Gives the buffers each episode's raw last observation, and warns of what would silently corrupt their data."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         #: Whether observations were normalised in the last training.
@@ -44,19 +44,19 @@ class WatchedEnvironmentMixin(SettingsMixin):
         self._warned_of_sharing = False
         env = cast(VecEnv, self.env)
         if self._last_obs is not None and not is_at(env, normalize, self._last_obs, self._last_original_obs):
-            # Evaluated since, for example: without a reset the next transition would begin in another state.
+            # Other code, such as an evaluation, stepped `env` since: the next transition would begin in another state.
             self._last_obs = None
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        every = super()._init_callback(callback, progress_bar)
-        for one in every_callback(every):
-            if any(shares_environment(cast(VecEnv, self.env), value) for value in vars(one).values()):
-                self._warn_of_shared_environment(type(one).__name__)
-        return every
+        combined = super()._init_callback(callback, progress_bar)
+        for each in every_callback(combined):
+            if any(shares_environment(cast(VecEnv, self.env), value) for value in vars(each).values()):
+                self._warn_of_shared_environment(type(each).__name__)
+        return combined
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """SB3's ``collect_rollouts``, with raw last observations, and a warning of steps by others."""
+        """SB3's ``collect_rollouts``, with raw last observations and a warning if other code steps the environment."""
         before = self.num_timesteps
         with watched_steps(env, self._vec_normalize_env) as calls:
             rollout = super().collect_rollouts(env, *args, **kwargs)

@@ -11,8 +11,9 @@ from sb3_sap.envs.constraints import constraint_ce1, constraint_ce2
 from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD, LaneKeepingEnv, ap_function, score
 from sb3_sap.envs.tracks import TRACKS, Track, get_track
 
+#: Control steps after which an episode is truncated: enough for a lap of the longest track (Spring, 8,000 steps at
+#: 50 km/h and 0.2 s).
 MAX_EPISODE_STEPS = 10_000
-"""Enough for a lap of the longest track (Spring, 8,000 steps at 50 km/h and 0.2 s); ends episodes of ``laps=None``."""
 
 
 def make_lane_keeping(
@@ -31,7 +32,7 @@ def make_lane_keeping(
     :param control_step: s between two actions
     :param laps: laps to drive, or None to drive on
     :param random_start: start anywhere on the track instead of at the line
-    :param off_track_reward: of the step that leaves the road or turns the car backwards
+    :param off_track_reward: reward of the step that leaves the road or turns the car backwards
     :param render_mode: None, "rgb_array" or "human"
     """
     from sb3_sap.envs.highway import HighwaySimulator
@@ -62,7 +63,7 @@ def make_torcs_lane_keeping(
     :param start: "training", 100 m before the line, or "race", the engine's own grid
     :param laps: laps to drive, or None to drive on
     :param random_start: start anywhere on the track
-    :param off_track_reward: of the step that leaves the road or turns the car backwards
+    :param off_track_reward: reward of the step that leaves the road or turns the car backwards
     :param render_mode: None, "rgb_array" or "human"
     """
     from sb3_sap.envs.torcs.simulator import TorcsSimulator
@@ -82,7 +83,10 @@ def make_torcs_driving(
     random_start: bool = False,
     render_mode: str | None = None,
 ) -> LaneKeepingEnv:
-    """Make `DrivingEnv` on TORCS: what ``gym.make("sap/TorcsDriving-v0", …)`` calls. Parameters as above."""
+    """Make `DrivingEnv` on TORCS: what ``gym.make("sap/TorcsDriving-v0", …)`` calls.
+
+    The parameters are those of `make_torcs_lane_keeping`.
+    """
     from sb3_sap.envs.torcs.driving import DrivingEnv
     from sb3_sap.envs.torcs.simulator import TorcsSimulator
 

@@ -6,43 +6,43 @@ from typing import NamedTuple, Protocol
 
 from sb3_sap.envs.tracks import Track
 
+#: Angle that the front wheels turn at steering 1, rad (21°, Table 1).
 STEERING_LOCK = 0.366519
-"""rad that the front wheels turn at steering 1, 21° (Table 1)."""
 
 
 class CarState(NamedTuple):
     """What the task needs to know of the car (Table 1)."""
 
+    #: rad, in [-pi, pi]: road heading minus yaw; positive when the car points to the right of the road.
+    #:
+    #: The sign is that of TORCS' sensors: positive steering corrects a positive angle.
     angle: float
-    """rad, in [-pi, pi]: road heading minus yaw; positive when the car points to the right of the road.
-
-    The sign is that of TORCS' sensors: positive steering corrects a positive angle."""
+    #: 2 · (distance to the left of the centre line, or axis) / width: 1 at the left edge, -1 at the right.
     track_pos: float
-    """2 · (distance to the left of the centre line) / width: 0 on the axis, 1 at the left edge, -1 at the right."""
+    #: km/h, along the car's longitudinal axis.
     speed_x: float
-    """km/h, along the car's longitudinal axis."""
+    #: km/h, along its transverse axis, positive to the left.
     speed_y: float
-    """km/h, along its transverse axis, positive to the left."""
+    #: km/h, along its vertical axis.
     speed_z: float
-    """km/h, along its vertical axis."""
+    #: m along the centre line from the start line, in [0, length).
     distance: float
-    """m along the centre line from the start line, in [0, length)."""
 
 
 class Simulator(Protocol):
     """Where the car drives: one car on one track, held at its default speed."""
 
+    #: Plan geometry, for the viewer.
     track: Track
-    """Plan geometry, for the viewer."""
+    #: m, one lap along the centre line.
     length: float
-    """m, one lap along the centre line."""
+    #: s, between two actions.
     control_step: float
-    """s, between two actions."""
+    #: Default start of the car: the arguments of `reset`.
     start: dict[str, float]
-    """Default start of the car: the arguments of `reset`."""
 
     def reset(self, distance: float, track_pos: float, angle: float) -> CarState:
-        """Put the car on the road, as `CarState` says it, and return where it stands."""
+        """Put the car on the road, with the units and signs of `CarState`, and return its state."""
         ...
 
     def step(self, steering: float) -> CarState:

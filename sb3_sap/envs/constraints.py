@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+#: Ends of the steering range.
 FULL_LEFT, FULL_RIGHT = 1.0, -1.0
-"""Ends of the steering range."""
 
 Interval = tuple[NDArray[Any], NDArray[Any]]
 
 
 def constraint_ce1(obs: NDArray[Any], previous_obs: NDArray[Any], last_action: NDArray[Any]) -> Interval:
-    """DDPG-CE1: left of the axis steer no further left than last time, right of it no further right."""
+    """DDPG-CE1: left of the centre line steer no further left than in the last step, right of it no further right."""
     del previous_obs
     track_pos = obs[1]
     low, high = np.full_like(last_action, FULL_RIGHT), np.full_like(last_action, FULL_LEFT)
@@ -34,7 +34,7 @@ def constraint_ce1(obs: NDArray[Any], previous_obs: NDArray[Any], last_action: N
 
 
 def constraint_ce2(obs: NDArray[Any], previous_obs: NDArray[Any], last_action: NDArray[Any]) -> Interval:
-    """DDPG-CE2: as CE1, but only after an action that took the car further from the axis."""
+    """DDPG-CE2: as CE1, but only after an action that took the car further from the centre line."""
     if abs(obs[1]) - abs(previous_obs[1]) > 0:
         return constraint_ce1(obs, previous_obs, last_action)
     return np.full_like(last_action, FULL_RIGHT), np.full_like(last_action, FULL_LEFT)

@@ -18,13 +18,12 @@ from sb3_sap.envs.car import STEERING_LOCK, CarState
 from sb3_sap.envs.tracks import Piece, Track, get_track
 from sb3_sap.envs.units import KMH
 
+#: Bounds of the default speed, km/h. Below them highway-env's model damps all turning; above them it brakes.
 MIN_SPEED, MAX_SPEED = 5.0, 144.0
-"""km/h. Below the first highway-env's model damps all turning; above the second it brakes."""
+#: Longest step of the integration at `SUB_STEP_SPEED` and above, s (see `HighwaySimulator`).
 SUB_STEP = 0.05
-"""s, longest step of the integration at 50 km/h and above (see `HighwaySimulator`)."""
+#: Speed below which the longest step shrinks in proportion to the speed, km/h.
 SUB_STEP_SPEED = 50.0
-"""km/h. At lower speeds the sub-step shrinks in proportion."""
-"""km/h in 1 m/s."""
 
 
 def road_lane(piece: Piece, width: float) -> AbstractLane:
@@ -32,10 +31,10 @@ def road_lane(piece: Piece, width: float) -> AbstractLane:
     if not piece.curvature:
         return StraightLane(piece.point(0.0)[:2], piece.point(piece.length)[:2], width)
     radius = 1 / piece.curvature  # signed: the centre lies this far to the left
-    center_x, center_y, _ = piece.point(0.0, radius)
+    centre_x, centre_y, _ = piece.point(0.0, radius)
     phase = piece.heading - math.copysign(math.pi / 2, radius)  # of the start, seen from the centre
     turn = piece.length * piece.curvature
-    return CircularLane((center_x, center_y), abs(radius), phase, phase + turn, clockwise=radius > 0, width=width)
+    return CircularLane((centre_x, centre_y), abs(radius), phase, phase + turn, clockwise=radius > 0, width=width)
 
 
 def road_network(track: Track) -> RoadNetwork:
@@ -80,7 +79,7 @@ class HighwaySimulator:
         """Put the car at ``distance`` m, at ``track_pos``, pointing ``angle`` rad to the right of the road."""
         x, y, heading = self.track.position(distance, track_pos * self.track.width / 2)
         self._piece = self.track.piece_at(distance)
-        # Without a road the vehicle does not search all lanes for the nearest one, which may be the wrong one.
+        # Without a road, the vehicle does not look for the nearest of all lanes, which may be the wrong one.
         self.vehicle = BicycleVehicle(None, (x, y), heading - angle, self.speed / KMH)
         return self._state()
 
@@ -92,7 +91,7 @@ class HighwaySimulator:
         return self._state()
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is held."""
 
     def _state(self) -> CarState:
         x, y = self.vehicle.position.tolist()

@@ -18,38 +18,38 @@ from sb3_sap.common.errors import nearest
 from sb3_sap.envs.car import CarState, Simulator
 from sb3_sap.envs.units import KMH
 
+#: Units of the observation: angle in 1 rad, trackPos in 1, speedX, speedY and speedZ in 50 km/h (order of Table 1).
 OBSERVATION_SCALE = np.array([1.0, 1.0, 50.0, 50.0, 50.0])
-"""What one unit of the observation is: angle 1 rad, trackPos 1, speedX, speedY and speedZ 50 km/h (Table 1's order)."""
+#: Magnitudes at which the observation is clipped: rad, trackPos, km/h.
 OBSERVATION_LIMIT = np.array([math.pi, 2.0, 200.0, 200.0, 200.0])
-"""Largest magnitudes that an observation shows: rad, trackPos, km/h. What lies beyond is clipped."""
+#: Reward of the step that leaves the road or turns the car backwards (from the code that the paper cites).
 OFF_TRACK_REWARD = -200.0
-"""Reward of the step that leaves the road or turns the car backwards (the value of the code that the paper cites)."""
+#: Speed |V_x| below which the car stands still, km/h.
 STILL_SPEED = 1.0
-"""km/h. A car whose |V_x| stays below it stands still …"""
+#: Time after which an episode ends if the car stands still, s.
 STILL_TIME = 5.0
-"""… and after so many seconds of that the episode ends …"""
+#: Time at the beginning of an episode that does not count, because a simulator may start the car from rest, s.
 GRACE_TIME = 3.0
-"""… not counting the first seconds of the episode, in which a simulator may have to start the car from rest."""
+#: Largest |trackPos| of a random start.
 RANDOM_TRACK_POS = 0.5
-"""Random starts lie within this |trackPos| …"""
+#: Largest |angle| of a random start, rad.
 RANDOM_ANGLE = 0.2
-"""… and within this |angle|, in rad."""
 
 Observation = NDArray[np.float32]
 Action = NDArray[np.float32]
 
 
 def reward(state: CarState) -> float:
-    """Return the reward of reaching ``state``, in km/h; at best V_x, on the axis and aligned with it.
+    """Return the reward of reaching ``state``, in km/h; at best V_x, on the centre line and aligned with it.
 
-    The bars on sin θ and δ are our reading: without them one edge of the road would pay more than the centre.
+    The paper leaves the absolute values of sin θ and δ open; without them one edge would pay more than the centre.
     """
     # δ is trackPos, θ the angle, V_x in km/h
     return state.speed_x * (math.cos(state.angle) - abs(math.sin(state.angle)) - abs(state.track_pos))  # Eq. (5)
 
 
 def ap_function(obs: NDArray[Any], actions: NDArray[Any], next_obs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Tell which actions were permissible: those that did not take the car further from the axis.
+    """Label as permissible the actions that did not take the car further from the centre line (Eq. 6).
 
     :param obs: observations, as the environment returns them, shape (n, 5)
     :param actions: the actions executed there, shape (n, 1); Eq. (6) judges by the states alone
@@ -88,14 +88,14 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
     ``covered``, the fraction driven of the laps (of one lap, beyond 1 too, if ``laps=None``); lap_done: they are
     covered; and after a step ``permissible``, Eq. (6) on the raw values.
 
-    ``reset(options={"distance": m, "track_pos": …, "angle": rad})`` chooses the start; what is not given is as usual.
+    ``reset(options={"distance": m, "track_pos": …, "angle": rad})`` chooses the start; the others keep their defaults.
 
-    :param simulator: what moves the car
+    :param simulator: moves the car
     :param laps: laps to drive, or None to drive on as the paper trains
-    :param random_start: start anywhere on the track, somewhat off the axis, instead of at the line, centred, aligned
-    :param off_track_reward: of the step that loses the road; the paper gives no value
+    :param random_start: start anywhere on the track, near the centre line, instead of centred and aligned at the start
+    :param off_track_reward: reward of the step that leaves the road or turns the car backwards; the paper gives none
     :param render_mode: None, "rgb_array" or "human"
-    :raise ValueError: for an option that cannot be, a start that does not exist, a steering of NaN
+    :raise ValueError: for an invalid argument, a start that does not exist, or a steering of NaN
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}  # type: ignore[misc]

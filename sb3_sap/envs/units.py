@@ -1,4 +1,4 @@
 """Units of measurement."""
 
+#: km/h per m/s.
 KMH = 3.6
-"""km/h that one m/s is."""

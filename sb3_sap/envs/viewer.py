@@ -21,29 +21,30 @@ from numpy.typing import NDArray
 from sb3_sap.envs.car import STEERING_LOCK, CarState
 from sb3_sap.envs.tracks import Track
 
+#: Width and height of the picture, in pixels.
 SIZE = (600, 400)
-"""Width and height of the picture, in pixels."""
+#: Factor by which the world is drawn larger and then scaled down, for smooth edges.
 OVERSAMPLING = 2
-"""The world is drawn so many times larger and scaled down, for smooth edges."""
+#: Pixels per metre of the world.
 SCALING = 9.0
-"""Pixels per metre of the world."""
+#: Distance between two points of the road's edges, m.
 ROAD_STEP = 1.0
-"""m between two points of the road's edges."""
+#: Distance from one dash of the centre line to the next, m; dashes are as long as highway-env's stripes.
 DASH_EVERY = 9.0
-"""m from one dash of the centre line to the next; each is as long as highway-env's stripes."""
+#: Longest side of the map, in pixels.
 MAP_SIZE = 96
-"""Longest side of the map, in pixels."""
+#: Distance between two points of the map's line, m.
 MAP_STEP = 10.0
-"""m between two points of the map's line."""
+#: Margin around the map and the panel's text, in pixels.
 MARGIN = 12
-"""Pixels around the map and the panel's text."""
+#: Height of the panel, in pixels.
 PANEL_HEIGHT = 34
-"""Pixels."""
+#: Distance from the middle of the car to the end of the fan, m.
 FAN_RADIUS = 13.0
-"""m from the middle of the car to the end of the fan."""
+#: Opacity of the fan, out of 255.
 FAN_OPACITY = 150
-"""Of 255."""
 
+#: Colours, RGB.
 GRASS, ASPHALT, LINE = (112, 150, 84), (138, 140, 145), (245, 245, 240)
 CAR, PANEL, ACCENT = (58, 140, 230), (28, 32, 38), (255, 190, 60)
 
@@ -95,7 +96,7 @@ class Viewer:
             self._window = None
 
     def _show(self) -> None:
-        # A window of our own, because pygame's display is one for all. Another environment may quit pygame at any time.
+        # A window of its own, because pygame has only one display. Another environment may quit pygame at any time.
         try:
             surface = None if self._window is None else self._window.get_surface()
         except pygame.error:
@@ -145,7 +146,7 @@ class Viewer:
 
     def _draw_fan(self, x: float, y: float, heading: float, steering: float, fan: NDArray[np.floating]) -> None:
         def end(action: float) -> tuple[int, int]:
-            """Where the front wheels point at, turned by an action."""
+            """The pixel at which the front wheels point, turned by an action."""
             angle = heading + action * STEERING_LOCK
             point: tuple[int, int] = self._world.vec2pix(
                 (x + FAN_RADIUS * math.cos(angle), y + FAN_RADIUS * math.sin(angle))

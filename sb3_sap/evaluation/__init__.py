@@ -1,4 +1,4 @@
-"""What was learned, measured and drawn: laps, policies from files, plots, statistics."""
+"""Evaluation: laps, policies loaded from files, plots and statistics."""
 
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import drive_lap

@@ -15,6 +15,6 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
 
 
 def find_environment(env_id: str) -> None:
-    """Import highway_env, which registers its tasks, if ``env_id`` is not registered."""
+    """Imports highway_env, which registers its tasks, if ``env_id`` is not registered."""
     if env_id not in gym.registry:
         importlib.import_module("highway_env")

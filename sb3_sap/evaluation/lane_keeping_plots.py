@@ -20,7 +20,7 @@ def learning_curve(training: pd.DataFrame, title: str, t_k: int | None = None) -
     """Average reward over the last 100 steps (Fig. 4a) and, where there is a predictor, its accuracy (Fig. 5).
 
     :param training: columns ``step``, ``reward``, ``off_track`` and ``validation_accuracy``
-    :param t_k: marked, if given
+    :param t_k: timestep at which guidance begins, marked if given
     """
     guided = training["validation_accuracy"].notna().any()
     figure = Figure(figsize=(8, 6 if guided else 3.6), layout="constrained")
@@ -52,15 +52,15 @@ def predictor_probabilities(model: Any, speed: float) -> Figure:
     """The predictor's probability that a steering action is permissible, over trackPos and over angle.
 
     :param model: a guided lane-keeping model
-    :param speed: km/h
+    :param speed: speed of the car along its axis, km/h
     """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    # On the axis itself Eq. (6) labels almost every action non-permissible, so the angle is swept beside it.
-    beside = 0.3
+    # On the axis itself Eq. (6) labels almost every action non-permissible, so the angle is swept next to it.
+    off_axis = 0.3
     sweeps = (
         (1, 1.0, 0.0, "trackPos (+1 left edge), car aligned with the road"),
-        (0, 0.5, beside, f"angle [rad] (+ points right), car at trackPos {beside}"),
+        (0, 0.5, off_axis, f"angle [rad] (+ points right), car at trackPos {off_axis}"),
     )
     for axis, (variable, limit, track_pos, label) in zip(axes, sweeps, strict=True):
         values = np.linspace(-limit, limit, RESOLUTION)

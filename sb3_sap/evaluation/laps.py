@@ -57,9 +57,10 @@ def lap(
 ) -> LapResult:
     """Drives one lap in an environment of :func:`lap_env`.
 
-    Several tracks are driven one after the other on purpose: a batched policy would save a tenth of the time, most of
-    which is physics, and would change the last bit of its actions.
+    Tracks are driven one after the other: most of the time is physics, so that a batched policy would save only a
+    tenth of it, and the last bit of its actions would change.
 
+    :param track: its name in the result
     :param on_step: called with the info of each step
     """
     rewards = []
@@ -75,7 +76,13 @@ def lap(
 
 
 def drive_lap(policy: Any, track: str, simulator: str = "highway", progress: Progress | None = None) -> LapResult:
-    """Drives one lap of a track."""
+    """Drives one lap of a track in an environment of its own.
+
+    :param policy: a model or policy with SB3's ``predict``
+    :param track: its name or file
+    :param simulator: a key of `ENVIRONMENTS`
+    :param progress: shows a bar, if given
+    """
     env = lap_env(track, simulator)
     try:
         if progress is None:

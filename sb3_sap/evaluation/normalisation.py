@@ -16,12 +16,12 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
-#: What RL Zoo calls the file, and the examples of SB3.
+#: Name of the file in RL Zoo and in SB3's examples.
 FILE_NAME = "vecnormalize.pkl"
 
 
 class NormalisedPolicy:
-    """Normalises raw observations as in the training of the policy; the statistics are constant.
+    """Normalises raw observations as in the training of the policy, with constant statistics.
 
     :param policy: takes normalised observations
     :param path: the file of the statistics
@@ -90,7 +90,7 @@ def find_statistics(model: Path) -> Path | None:
 def with_statistics(
     policy: BasePolicy, model: Path, learned_normalised: bool | None, given: Path | None
 ) -> BasePolicy | NormalisedPolicy:
-    """The policy, with the statistics given or found if it needs any.
+    """The policy, wrapped with the statistics that are given, or found beside the model, if it needs any.
 
     :param learned_normalised: whether the model learned on normalised observations; ``None``: unknown
     """

@@ -12,8 +12,9 @@ from stable_baselines3.common.monitor import Monitor, load_results
 
 from sb3_sap.common.files import atomic_path
 
-#: Points of a mean over several runs.
+#: Number of points at which the mean over several runs is drawn.
 POINTS = 200
+#: Resolution of saved figures, dots per inch.
 DPI = 120
 
 
@@ -46,7 +47,7 @@ def return_curves(runs: Mapping[str, str | Path | Sequence[str | Path]], window:
         if len(curves) > 1:
             for steps, average in curves:
                 axis.plot(steps, average, color=colour, alpha=0.3, linewidth=0.8)
-        # Over the steps that every run has behind it.
+        # The mean is taken over the steps that every run has done.
         grid = np.linspace(max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves), POINTS)
         mean = np.mean([np.interp(grid, steps, average) for steps, average in curves], axis=0)
         axis.plot(grid, mean, color=colour, linewidth=2, label=name)

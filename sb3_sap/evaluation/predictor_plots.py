@@ -15,7 +15,7 @@ from sb3_sap.predictor.network import candidate_logits
 
 #: Points along each axis of a picture.
 RESOLUTION = 121
-#: Bounds beyond this do not describe the range that occurs.
+#: Magnitude beyond which a bound of the space does not describe the values that occur.
 UNBOUNDED = 1e6
 
 
@@ -28,7 +28,7 @@ def permissible_probability(model: Any, obs: Observations, actions: np.ndarray[A
     :param actions: (n, m, *action_shape), or (m, *action_shape) for every state, in the environment's units
     :return: (n, m)
     """
-    tensors, _ = model.policy.obs_to_tensor(_as_the_policy_sees(model, obs))
+    tensors, _ = model.policy.obs_to_tensor(_normalised(model, obs))
     features = model.predictor.features(tensors)
     shape = model.action_space.shape
     scaled = actions if isinstance(model.action_space, spaces.Discrete) else model.policy.scale_action(actions)
@@ -50,8 +50,8 @@ def plot_permissibility(
 ) -> Figure:
     """Draws the predicted permissible region over one state variable and one action, with the actor's choice on it.
 
-    All values are in the environment's units. The other state variables are held, and the other actions are the
-    actor's.
+    All values are in the environment's units. The other state variables keep the values of one observation, and the
+    other actions are the actor's.
 
     :param model: a guided model whose predictor was fitted
     :param variable: index of the state variable in the flattened observation; of a ``Dict``: (key, index)
@@ -82,14 +82,14 @@ def plot_permissibility(
             f"`variable` = {variable!r}, `action` = {action!r}: there is no such variable of a Box in "
             f"{model.observation_space} or no such action in {model.action_space}."
         )
-    seen = _seen(model)
+    seen = _training_observations(model)
     if limits is None:
-        column = None if seen is None else seen[key].reshape(len(seen[key]), -1)[:, index]
-        limits = _limits(space.low.flat[index], space.high.flat[index], column)
+        occurred = None if seen is None else seen[key].reshape(len(seen[key]), -1)[:, index]
+        limits = _limits(space.low.flat[index], space.high.flat[index], occurred)
     values = np.linspace(*limits, RESOLUTION)
-    held = _typical(model) if obs is None else obs
-    invented = held is None
-    if invented:
+    held = _typical_observation(model) if obs is None else obs
+    unknown = held is None
+    if unknown:
         held = _zeros(model.observation_space)
     rows = held if isinstance(held, dict) else {"": held}
     rows = {k: np.repeat(np.asarray(v)[None], RESOLUTION, axis=0) for k, v in rows.items()}
@@ -99,7 +99,7 @@ def plot_permissibility(
     image = draw_permissibility(axis, model, values, rows.get("", rows), action)
     axis.set(xlabel=variable_name or f"{key or 'observation'}[{index}]")
     axis.set(ylabel=action_name or ("action" if n_actions == 1 else f"action[{action}]"))
-    if invented:
+    if unknown:
         axis.set_title("the other variables are held at 0: such a state may not occur", fontsize="small")
     figure = axis.get_figure(root=True)
     assert figure is not None
@@ -115,7 +115,7 @@ def draw_permissibility(axis: Axes, model: Any, values: FloatArray, obs: Observa
     :return: the image, for a colour bar
     """
     space = model.action_space
-    chosen = model.predict(_as_the_policy_sees(model, obs), deterministic=True)[0]
+    chosen = model.predict(_normalised(model, obs), deterministic=True)[0]
     if isinstance(space, spaces.Discrete):
         heights: Any = np.arange(space.n)  # discrete actions count from 0 in SB3
         probability = permissible_probability(model, obs, heights)
@@ -134,22 +134,23 @@ def draw_permissibility(axis: Axes, model: Any, values: FloatArray, obs: Observa
     return image
 
 
-def _as_the_policy_sees(model: Any, obs: Observations) -> Any:
+def _normalised(model: Any, obs: Observations) -> Any:
+    """Raw observations as the policy gets them."""
     env = model.get_vec_normalize_env()
     return obs if env is None else env.normalize_obs(obs)
 
 
-def _seen(model: Any) -> dict[str, np.ndarray[Any, Any]] | None:
+def _training_observations(model: Any) -> dict[str, np.ndarray[Any, Any]] | None:
     """The raw training observations of K, per key; None where there are none, as after ``load``."""
     knowledge = model.knowledge
     if len(knowledge) == 0:
         return None
-    # Not `sample`, whose generator is the training's.
+    # `sample` would draw from the generator of the training.
     slots = np.concatenate([knowledge.parts["train"].slots(label) for label in (0, 1)])
     return {key: store[slots] for key, store in knowledge.observations.items()}
 
 
-def _typical(model: Any) -> Any:
+def _typical_observation(model: Any) -> Any:
     """A raw observation that occurred; None where none is known."""
     typical = model.knowledge.typical_observation()
     return model.typical_observation if typical is None else typical

@@ -11,7 +11,7 @@ from sb3_sap.common.arrays import FloatArray
 
 
 def interquartile_mean(scores: np.ndarray[Any, Any]) -> float:
-    """Mean of the middle half of all runs on all tasks; (runs, tasks)."""
+    """Mean of the middle half of the scores, (runs, tasks), of all runs on all tasks."""
     return float(stats.trim_mean(scores, 0.25, axis=None))
 
 
@@ -21,6 +21,7 @@ def bootstrap_interval(
     """Percentile interval of the interquartile mean, resampling runs within each task (stratified bootstrap).
 
     :param scores: (runs, tasks)
+    :return: lower and upper end
     """
     means = _resampled_means(np.random.default_rng(seed), scores, resamples)
     tail = (1 - confidence) / 2
@@ -35,6 +36,7 @@ def probability_of_improvement(
 
     :param ours: (runs, tasks)
     :param theirs: (runs, tasks), of the same tasks
+    :return: the probability, and the ends of its interval
     """
     rng = np.random.default_rng(seed)
 
@@ -49,7 +51,7 @@ def probability_of_improvement(
 
 
 def _share_of_wins(ours: FloatArray, theirs: FloatArray) -> Any:
-    """Over all pairs of runs and all tasks; (…, runs, tasks) each."""
+    """Share of the pairs of runs that ours win, mean over tasks; scores are (…, runs, tasks)."""
     difference = ours[..., :, None, :] - theirs[..., None, :, :]  # (…, our runs, their runs, tasks)
     return ((np.sign(difference) + 1) / 2).mean(axis=(-3, -2, -1))
 
@@ -61,6 +63,7 @@ def bootstrap_difference(
 
     :param scores: (runs, tasks)
     :param others: (runs, tasks), what is subtracted
+    :return: the difference, and the ends of its interval
     """
     rng = np.random.default_rng(seed)
     differences = _resampled_means(rng, scores, resamples) - _resampled_means(rng, others, resamples)

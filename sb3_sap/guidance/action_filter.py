@@ -41,7 +41,7 @@ def guided_prediction(
     """Replaces each action that is not permissible by the nearest permissible candidate, if there is any.
 
     The same observation always gives the same action: the candidates are drawn with a seed of their own. ``alpha`` and
-    ``constraint``, which needs the previous action, are ignored; E is queried once it was fitted.
+    ``constraint``, which needs the previous action, are ignored; E is queried only if it was fitted.
 
     :param observation: one, or a batch, as ``predict`` takes it
     :param actions: what the policy proposes, in the environment's units
@@ -54,17 +54,17 @@ def guided_prediction(
             "`permissible_actions` judges observations as the environment gives them, but this model takes normalised "
             "ones and has no statistics to undo that: load it with its VecNormalize, `load(path, env=...)`."
         )
-    seen = policy_layout(observation, model.observation_space)
+    raw = policy_layout(observation, model.observation_space)
     if not is_batch:
-        seen = {key: value[None] for key, value in seen.items()} if isinstance(seen, dict) else seen[None]
-    raw = environment_layout(seen if env is None else unnormalized(env, seen, model.observation_space), model.images)
+        raw = {key: value[None] for key, value in raw.items()} if isinstance(raw, dict) else raw[None]
+    raw = environment_layout(raw if env is None else unnormalized(env, raw, model.observation_space), model.images)
     proposed = np.asarray(actions).reshape(-1, *shape)
     if not model.discrete:
         proposed = model.policy.scale_action(proposed)
     flat = proposed.reshape(len(proposed), -1)
     ones = np.ones_like(flat[:1])
     candidates = candidate_actions(np.random.default_rng(0), model.action_space, -ones, ones, model.n_candidates)
-    candidates = candidates.repeat(len(flat), axis=0)  # the same beside others in a batch
+    candidates = candidates.repeat(len(flat), axis=0)  # the same for every state of a batch
     # The proposal itself comes first and is its own nearest candidate.
     candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
     permissible = model.allowed_candidates(raw, candidates)

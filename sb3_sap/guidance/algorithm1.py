@@ -25,16 +25,16 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
 
     :param alpha: α, probability of querying E once it is accurate enough
     :param alpha_low: the same while E's balanced validation accuracy is below 70 % (the paper gives no value)
-    :param t_k: timesteps with noise and without guidance, counted over the model's whole life. ``None``:
-        ``learning_starts``, whose uniform random steps are part of it
+    :param t_k: timesteps with noise and without guidance, counted over the model's whole life, the uniform random
+        steps of ``learning_starts`` included. ``None``: ``learning_starts``
     :param guidance_end: timestep after which exploration is unguided, counted like ``t_k``; ``None`` (paper): never.
-        Unless ``teaching_growth`` says otherwise, the auxiliary actor loss ends with it, and E is refitted only every
+        Unless ``teaching_growth`` is set, the auxiliary actor loss ends with it, and E is refitted only every
         fifth time
-    :param candidate_selection: how line 11 chooses among the permissible candidates: "random" as in the paper, the one
-        "nearest" to the actor's action, the one of "highest_q", or the one that is "most_permissible" to E
+    :param candidate_selection: how line 11 chooses among the permissible candidates: ``"random"`` (paper),
+        ``"nearest"`` to the actor's action, ``"highest_q"``, or ``"most_permissible"`` according to E
     """
 
-    #: Whether the policy is stochastic, so that the steps before t_k need no action noise.
+    #: Whether the algorithm explores by itself (stochastic or ε-greedy), so that steps before t_k need no action noise.
     stochastic_policy: ClassVar[bool] = False
 
     def __init__(
@@ -59,7 +59,7 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        """The actions a_t of all environments, in their units and scaled."""
+        """The actions a_t of all environments, in their units and scaled, each (n_envs, *action_shape)."""
         if self.lifetime_steps < self.noise_steps:
             # The base algorithm explores: a_t = μ(s_t) + N_t                                  # lines 1-4
             return super()._sample_action(learning_starts, action_noise, n_envs)
@@ -117,25 +117,25 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         if self.candidate_selection == "nearest":
             return np.asarray(-np.linalg.norm(candidates - actions[:, None], axis=2))
         m, n, dim = candidates.shape
-        every = rows_of(obs, np.repeat(np.arange(m), n))
-        q = q_values(self, every, th.as_tensor(candidates.reshape(m * n, dim), device=self.device))
+        repeated = rows_of(obs, np.repeat(np.arange(m), n))
+        q = q_values(self, repeated, th.as_tensor(candidates.reshape(m * n, dim), device=self.device))
         return q.cpu().numpy().reshape(m, n)
 
     # ---------------------------------------------------------------- settings
 
     @property
     def noise_steps(self) -> int:
-        """t_k, or ``learning_starts`` where it was left open."""
+        """t_k, or ``learning_starts`` if ``t_k`` is ``None``."""
         return self.learning_starts if self.t_k is None else self.t_k
 
     @property
     def guidance_ended(self) -> bool:
-        """Whether exploration is unguided again."""
+        """Whether ``guidance_end`` is reached."""
         return self.guidance_end is not None and self.lifetime_steps >= self.guidance_end
 
     @property
     def current_alpha(self) -> float:
-        """α as E's validation accuracy allows it (section 4.3)."""
+        """α, or at most ``alpha_low`` while E is not accurate enough (section 4.3)."""
         return self.alpha if self.predictor_accurate else min(self.alpha_low, self.alpha)
 
     def _setup_model(self) -> None:

@@ -57,24 +57,24 @@ def permissible_value_step(
     batch_size: int,
     env: VecNormalize | None = None,
 ) -> float:
-    """Discrete actions: the greedy action takes the actor's place; one step on β · softplus(Q(s, a) − Q(s, b)).
+    """One gradient step of the Q-values on β · softplus(Q(s, a) − Q(s, b)), for discrete actions.
 
-    a is each action that E rejects, b the best one that it permits: this is the cross-entropy of preferring b. The
-    values of actions that guidance prevents are never corrected by experience: with negative rewards, an unknown
-    action looks better than every known one. By Definition 3 no optimal policy takes it, so its value is free. Both
-    values move, because lowering one alone would lower all values that share its features, without end.
+    a is each action that E rejects, b the action of highest value that E permits: the loss is the cross-entropy of
+    preferring b to a. Experience never corrects the values of actions that guidance prevents: with negative rewards,
+    an unknown action looks better than every known one. By Definition 3 no optimal policy takes it, so that its value
+    is free. Both values have a gradient, because lowering one alone would lower all that share its features, for ever.
 
     :param model: DQN or QR-DQN
-    :return: the loss before the step; 0 if E separates the actions of no state
+    :return: the loss before the step; 0 if in no state E rejects some actions and permits others
     """
     observations = replay_buffer.sample(batch_size, env=env).observations
     model.policy.set_training_mode(False)
     values = action_values(model, observations)  # (n, k)
     n, k = values.shape
     with th.no_grad():
-        every = th.arange(k, device=values.device).repeat(n, 1)
+        actions = th.arange(k, device=values.device).repeat(n, 1)
         features = predictor.features(observations).repeat_interleave(k, dim=0)
-        rejected = (predictor.logits(features, every.flatten()) <= 0).reshape(n, k)
+        rejected = (predictor.logits(features, actions.flatten()) <= 0).reshape(n, k)
     best = values.masked_fill(rejected, -th.inf).max(dim=1, keepdim=True).values
     separated = rejected & best.isfinite()
     if not separated.any():

@@ -29,8 +29,8 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         :func:`~sb3_sap.guidance.auxiliary_loss.permissible_value_step`). It is applied while E is accurate enough for
         ``alpha``
     :param teaching_growth: like ``refit_growth``, for the auxiliary loss, counted in actor updates; 0: after every
-        update, and on after ``guidance_end``, with E refitted at least every fifteen steps. ``None``: as often as E
-        is fitted, until ``guidance_end``
+        update. The loss then continues after ``guidance_end``, and E is refitted at least every fifteen steps.
+        ``None``: as often as E is fitted, until ``guidance_end``
     """
 
     schedules = (*SettingsMixin.schedules, "actor_permissibility_coef")

@@ -48,11 +48,11 @@ def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: Float
 def choose(
     rng: np.random.Generator, candidates: np.ndarray[Any, Any], permissible: BoolArray, scores: FloatArray | None
 ) -> np.ndarray[Any, Any]:
-    """One permissible candidate of each state that has any.
+    """One permissible candidate for each of m states.
 
     :param candidates: (m, n, action_dim)
     :param permissible: (m, n), each row with at least one True
-    :param scores: (m, n), of which the highest wins; None: one at random
+    :param scores: (m, n), of which the highest is chosen; ``None``: a candidate is drawn at random
     :return: (m, action_dim)
     """
     if scores is None:

@@ -1,4 +1,4 @@
-"""Exploration within what can be decided before an action is executed: constraints, and permissible actions."""
+"""Exploration within constraints and permissible actions, both known before an action is executed."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class ConstrainedExplorationMixin(SettingsMixin):
         saved_rng = self.exploration_rng
         check_at_least(self, n_candidates=1)
         self._constraint, self._permissible_actions = (
-            None if rule is None else resolve(rule, name)
-            for name, rule in (("constraint", self.constraint), ("permissible_actions", self.permissible_actions))
+            None if function is None else resolve(function, name)
+            for name, function in (("constraint", self.constraint), ("permissible_actions", self.permissible_actions))
         )
         if self._constraint is not None and isinstance(self.action_space, spaces.Discrete):
             raise ValueError(
@@ -100,15 +100,15 @@ class ConstrainedExplorationMixin(SettingsMixin):
             forbidden = np.flatnonzero(~self._allowed(self.raw_last_obs(), scaled))
             if len(forbidden):
                 candidates, allowed = self.sample_candidates(forbidden, n_envs)
-                some = allowed.any(axis=1)
-                if some.any():
-                    chosen = choose(self.exploration_rng, candidates[some], allowed[some], scores=None)
-                    scaled[forbidden[some]] = chosen.reshape(-1, *scaled.shape[1:])
+                found = allowed.any(axis=1)
+                if found.any():
+                    chosen = choose(self.exploration_rng, candidates[found], allowed[found], scores=None)
+                    scaled[forbidden[found]] = chosen.reshape(-1, *scaled.shape[1:])
                     action = self.unscale_actions(scaled)
         return action, scaled
 
     def sample_candidates(self, rows: np.ndarray[Any, Any], n_envs: int) -> tuple[np.ndarray[Any, Any], BoolArray]:
-        """A_st for m of the environments, (m, N, action_dim) scaled, and which candidates are allowed, (m, N)."""
+        """A_st of the environments in ``rows``, (m, N, action_dim) scaled, and which are allowed, (m, N)."""
         low, high = (bound.reshape(n_envs, -1)[rows] for bound in self._allowed_interval(n_envs))
         candidates = candidate_actions(self.exploration_rng, self.action_space, low, high, self.n_candidates)
         return candidates, self.allowed_candidates(rows_of(self.raw_last_obs(), rows), candidates)
@@ -118,8 +118,8 @@ class ConstrainedExplorationMixin(SettingsMixin):
         m, n, _ = candidates.shape
         if self._permissible_actions is None:
             return np.ones((m, n), dtype=bool)
-        every = rows_of(raw_obs, np.repeat(np.arange(m), n))
-        return self._allowed(every, candidates.reshape(m * n, *cast(Any, self.action_space).shape)).reshape(m, n)
+        repeated = rows_of(raw_obs, np.repeat(np.arange(m), n))
+        return self._allowed(repeated, candidates.reshape(m * n, *cast(Any, self.action_space).shape)).reshape(m, n)
 
     def _allowed(self, raw_obs: Any, scaled: np.ndarray[Any, Any]) -> BoolArray:
         assert self._permissible_actions is not None

@@ -25,9 +25,9 @@ def query_constraint(constraint: ActionConstraint, shape: tuple[int, ...], *situ
     """Calls a user's constraint and checks what it returns.
 
     :param shape: of one action
-    :param situation: obs, previous_obs and last_action
-    :raise RuntimeError: if the constraint raised an error
-    :raise ValueError: for an answer that is no interval of such actions
+    :param situation: obs, previous_obs and last_action, as the constraint takes them
+    :raise RuntimeError: if the constraint raises an error
+    :raise ValueError: if it does not return an interval of such actions
     """
     try:
         answer = constraint(*map(copy_observation, situation))

@@ -13,7 +13,7 @@ from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
 class ActionPermissibilityMixin(AuxiliaryLossMixin):
     """Guides an SB3 off-policy algorithm with a learned AP predictor (Algorithm 1).
 
-    Goes before the algorithm in the bases of a class. Each class of the chain has one task, and passes on to the next::
+    Goes before the algorithm in the bases of a class. Each class of the chain has one task and calls the next::
 
         ActionPermissibilityMixin    predict(guided=True)
         AuxiliaryLossMixin           the auxiliary loss of the actor or the Q-values

@@ -1,4 +1,4 @@
-"""What the critics or Q-networks of any off-policy algorithm say of actions."""
+"""Values of actions according to the critics or Q-networks of any off-policy algorithm."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Labels, the knowledge buffer K and the AP predictor E: what is learned of permissibility, whoever acts."""
+"""Labels, the knowledge buffer K and the AP predictor E; nothing here chooses actions."""

@@ -50,7 +50,7 @@ class KnowledgeMixin(ReplayBuffer):
         # SB3 passes raw observations here, and the true last one of an episode.
         for i, info in enumerate(infos):
             if RAW_LAST in info:
-                _put(next_obs, i, info[RAW_LAST])
+                _set_row(next_obs, i, info[RAW_LAST])
         if self.ap_function is not None:
             before, after = (environment_layout(o, self.images) for o in (obs, next_obs))
             labels = query_labels(self.ap_function, "ap_function", before, self._unscale(action), after)
@@ -89,7 +89,7 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
     """The same with hindsight goals; K keeps the goals that were pursued."""
 
 
-#: The version of each of SB3's buffers for a guided algorithm.
+#: For each of SB3's replay buffers, the version that also fills K.
 GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
     ReplayBuffer: PermissibilityReplayBuffer,
     DictReplayBuffer: PermissibilityDictReplayBuffer,
@@ -98,7 +98,7 @@ GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
 }
 
 
-def _put(observations: Any, row: int, obs: Any) -> None:
+def _set_row(observations: Any, row: int, obs: Any) -> None:
     """Writes one observation into a batch."""
     if isinstance(observations, dict):
         for key, batch in observations.items():
@@ -110,8 +110,11 @@ def _put(observations: Any, row: int, obs: Any) -> None:
 def guided_buffer_class(
     requested: type[ReplayBuffer] | None, observation_space: spaces.Space[Any], n_steps: int
 ) -> type[KnowledgeMixin]:
-    """The requested buffer class, or the one that SB3 would have chosen, in the version that fills K."""
-    # A saved model names the class that its own n_steps led to; `load` may be given others.
+    """The requested buffer class, or the one that SB3 would have chosen, in the version that fills K.
+
+    :raise ValueError: if the requested class does not fill K, or does not take ``n_steps``
+    """
+    # A saved model holds the class chosen for its own `n_steps`, and `load` may be given another `n_steps`.
     if requested is None or requested is PermissibilityReplayBuffer:
         plain = NStepReplayBuffer if n_steps > 1 else ReplayBuffer
         requested = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else plain
@@ -131,7 +134,7 @@ def guided_buffer_class(
 
 
 def check_fits(loaded: ReplayBuffer, model: Any) -> None:
-    """Refuses a loaded buffer that a model cannot go on with.
+    """Checks that a model can go on with a loaded replay buffer.
 
     :raise TypeError: if it holds no K
     :raise ValueError: if it comes from another environment, or from another number of them

@@ -17,7 +17,7 @@ from sb3_sap.predictor.buffers import KnowledgeMixin, guided_buffer_class
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.network import PermissibilityPredictor
 
-#: By default E extracts features from observations as the policy does.
+#: Arguments whose defaults are the policy's, so that E extracts features from observations as the policy does.
 SHARED = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
 #: Arguments of the predictor that its saved weights and optimizer depend on.
 ARCHITECTURE = (
@@ -40,7 +40,7 @@ def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[Permissibility
     :raise ValueError: for another architecture than the saved one
     """
     own = with_extractor(model.predictor_kwargs)
-    if "features_extractor_class" in own:  # which the other's arguments would not fit
+    if "features_extractor_class" in own:  # the arguments of the policy's extractor would not fit it
         own = {"features_extractor_kwargs": {}, **own}
     arguments = {name: getattr(model.policy, name) for name in SHARED} | own
     known = inspect.signature(PermissibilityPredictor).parameters
@@ -60,7 +60,7 @@ def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[Permissibility
     with own_generators(int(make_rng(model.seed, "predictor").integers(2**31)), model.device):
         predictor = PermissibilityPredictor(model.observation_space, model.action_space, **arguments)
     predictor = predictor.to(model.device)
-    # Some optimizers, such as Adagrad, have a state from the start, which loading moves to the device of the weights.
+    # Some optimizers, such as Adagrad, have a state from the start; loading it moves it to the device of the weights.
     predictor.optimizer.load_state_dict(predictor.optimizer.state_dict())
     return predictor, architecture
 
@@ -88,7 +88,10 @@ def make_knowledge(model: Any) -> KnowledgeBuffer:
 
 
 def make_replay_buffer(model: Any) -> KnowledgeMixin:
-    """An empty R that feeds an empty K, of the requested class or the one that SB3 would have chosen."""
+    """An empty R that feeds an empty K, of the requested class or the one that SB3 would have chosen.
+
+    :raise ValueError: if the class does not fit the settings or the observations
+    """
     buffer_class = guided_buffer_class(model.replay_buffer_class, model.observation_space, model.n_steps)
     kwargs: dict[str, Any] = dict(model.replay_buffer_kwargs)
     if issubclass(buffer_class, NStepReplayBuffer):
@@ -115,7 +118,7 @@ def make_replay_buffer(model: Any) -> KnowledgeMixin:
 
 
 def described(value: Any) -> Any:
-    """An argument of a network as words and numbers, which do not change when a model is saved and loaded."""
+    """An argument of a network as text and numbers, which are equal again after saving and loading."""
     if isinstance(value, Mapping):
         return {str(key): described(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

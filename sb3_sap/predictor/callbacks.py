@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from sb3_sap.predictor.knowledge import NON_PERMISSIBLE, PERMISSIBLE, KnowledgeBuffer
 from sb3_sap.predictor.tensorboard import add_layout
 
-#: Number of labels, all of one class, after which the user is warned.
+#: Number of labels after which a warning is given if all are of one class.
 CONSTANT_LABELS_WARNING = 1_000
 
 
@@ -22,12 +22,12 @@ class PermissibilityCallback(BaseCallback):
     pass an instance to ``learn(callback=...)``: it replaces the default one.
     """
 
-    model: Any  # a guided model: what it needs is in LearnedPermissibilityMixin
+    model: Any  # a guided model, that is a LearnedPermissibilityMixin
 
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
-        self._start = 0  # step of the model's life at which the rollout began
-        self._seen: tuple[int, ...] = (0, 0)
+        self._start = 0  # `lifetime_steps` at which the rollout began
+        self._seen: tuple[int, ...] = (0, 0)  # labels of each class, when the rollout began
         self._warned = False
 
     @property

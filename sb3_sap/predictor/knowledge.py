@@ -19,13 +19,13 @@ from sb3_sap.predictor.slots import ClassSlots
 
 NON_PERMISSIBLE, PERMISSIBLE = 0, 1
 CLASSES = (NON_PERMISSIBLE, PERMISSIBLE)
-#: Maximum number of observations among which a typical one is sought.
+#: Maximum number of observations among which the typical one is sought.
 TYPICAL = 1_000
 Part = Literal["train", "validation"]
 
 
 class LabelledActions(NamedTuple):
-    """A balanced sample of K: n rows, half of them permissible."""
+    """A sample of K: n rows, of which half are permissible if it is balanced."""
 
     observations: Observations  # (n, *obs_shape)
     actions: np.ndarray[Any, Any]  # (n, action_dim), scaled to [-1, 1]
@@ -42,7 +42,7 @@ class KnowledgeBuffer:
     :param size: capacity; the paper's is 10,000
     :param validation_fraction: share kept for validation; the paper's 9:1 is 0.1
     :param seed: of the generator that splits and samples
-    :param min_per_class: tuples of a class, in each part, up to which it may replace tuples of the other class
+    :param min_per_class: tuples of each class, in each part, for which a full K makes room at the other class's cost
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class KnowledgeBuffer:
         return sum(len(part) for part in self.parts.values())
 
     def __getstate__(self) -> dict[str, Any]:
-        """What pickle writes: of the arrays only the rows that hold something, which are the first of each part."""
+        """For pickle: of the arrays only the filled rows, which come first in each part."""
         filled = self._filled()
         rows = {key: store[filled] for key, store in self.observations.items()}
         return {**vars(self), "observations": rows, "actions": self.actions[filled]}
@@ -91,7 +91,7 @@ class KnowledgeBuffer:
         filled = self._filled()
 
         def whole(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-            if len(rows) == self.size:  # all of it is filled, or an earlier version wrote it in full
+            if len(rows) == self.size:  # every row is filled, or an earlier version wrote all rows
                 return rows
             store = np.zeros((self.size, *rows.shape[1:]), rows.dtype)
             store[filled] = rows
@@ -144,9 +144,9 @@ class KnowledgeBuffer:
             self.seen[int(label)] += 1
 
     def typical_observation(self) -> Any:
-        """The raw observation of K that lies nearest to the median of them; None where there is none.
+        """The raw observation in K that lies nearest to the median of all; ``None`` if K is empty.
 
-        A median itself need not be any possible state, such as the sine and cosine of an angle.
+        The median itself may be an impossible state, for example of the sine and cosine of an angle.
         """
         slots = np.concatenate([self.parts["train"].slots(label) for label in CLASSES])
         if len(slots) == 0:
@@ -166,6 +166,8 @@ class KnowledgeBuffer:
     ) -> LabelledActions:
         """Draws a balanced D_E: n // 2 tuples of each class, with replacement, in random order.
 
+        :param n: N_E; an odd number is rounded down
+        :param part: the part of K to draw from
         :param env: normalises the observations, if given
         :param balanced: False draws every tuple with the same probability
         """

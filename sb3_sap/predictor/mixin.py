@@ -1,4 +1,4 @@
-"""Gives a model its labels, its knowledge buffer K and its AP predictor E, and saves them with it."""
+"""Adds labels, the knowledge buffer K (saved with the replay buffer) and the AP predictor E (saved with the model)."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     :param validation_fraction: share of K kept for validation
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
-    :param min_per_class: examples of each class that K must hold before E is fitted, and makes room for when it is full
+    :param min_per_class: examples of each class that K must hold before E is fitted, and for which a full K makes room
     :param refit_growth: refit and validate E when the step count has grown by this fraction, because a few new
         examples change it less and less, while a fit costs the same; 0 (paper): every step, or as often as
         ``predictor_gradient_steps`` says
     :param predictor_gradient_steps: maximum number of fits after each rollout, like ``gradient_steps`` of the base
-        algorithm; -1: one for each vectorised step. ``None``: as many as the base's gradient steps, which are fewer
-        than its steps for DQN; with a ``refit_growth`` above 0 that alone decides
+        algorithm; -1: one for each vectorised step. ``None``: as many as the base's gradient steps, which for DQN
+        are fewer than its timesteps; no maximum if ``refit_growth`` is above 0
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.network.PermissibilityPredictor`
     """
 
@@ -71,7 +71,7 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
         self._steps_of_earlier_learns = 0
-        #: A raw observation amid those of the training, noted when the model is saved.
+        #: A typical raw observation of the training, noted when the model is saved.
         self.typical_observation: Any = None
         #: Describes the architecture of the predictor, whose saved weights fit no other.
         self._predictor_architecture: dict[str, Any] = {}
@@ -84,14 +84,14 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
             check_at_least(self, predictor_gradient_steps=-1)
         if self.replay_buffer is None:
             self.replay_buffer = make_replay_buffer(self)
-        # SB3 warns about any buffer class beside n_steps; the buffer above was given n_steps.
+        # SB3 warns of a buffer class together with `n_steps`, which the buffer above has been given.
         self.replay_buffer_class = None
-        # It writes n_steps and gamma into these, where they would outlive a `load` with others.
-        own, self.replay_buffer_kwargs = self.replay_buffer_kwargs, dict(self.replay_buffer_kwargs)
+        # SB3 writes `n_steps` and `gamma` into this dictionary, where they would override those of a later `load`.
+        given, self.replay_buffer_kwargs = self.replay_buffer_kwargs, dict(self.replay_buffer_kwargs)
         super()._setup_model()
-        self.replay_buffer_kwargs = own
+        self.replay_buffer_kwargs = given
         self.replay_buffer_class = type(self.replay_buffer)
-        self._connect(cast(KnowledgeMixin, self.replay_buffer))
+        self._set_label_source(cast(KnowledgeMixin, self.replay_buffer))
         self.predictor, self._predictor_architecture = make_predictor(self, self._predictor_architecture)
 
     @property
@@ -99,11 +99,11 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         """K, which is filled by the replay buffer and saved with it."""
         return cast(KnowledgeMixin, self.replay_buffer).knowledge
 
-    def _connect(self, buffer: KnowledgeMixin) -> None:
-        """Tells a buffer where its labels come from."""
+    def _set_label_source(self, buffer: KnowledgeMixin) -> None:
+        """Sets where a replay buffer takes its labels from."""
         buffer.ap_function = None if self.ap_function is None else resolve(self.ap_function, "ap_function")
         buffer.images = self.images
-        # Actions that are ruled out beforehand need no labels of what was executed.
+        # With `permissible_actions` a model may do without labels of executed actions.
         buffer.needs_labels = getattr(self, "permissible_actions", None) is None
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -112,7 +112,7 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
             self.knowledge.seed(seed)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        # Installed here and not by the user, who would get the unguided algorithm by forgetting it.
+        # Added here, because a user who forgot it would silently train the unguided algorithm.
         if not contains_permissibility_callback(callback):
             if not isinstance(callback, (list, BaseCallback)):
                 callback = ConvertCallback(callback)
@@ -129,24 +129,25 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self._steps_of_earlier_learns += self.num_timesteps
-        self._connect(cast(KnowledgeMixin, self.replay_buffer))  # a copied model's buffer has lost its function
+        # The buffer of a copied model has lost its AP function.
+        self._set_label_source(cast(KnowledgeMixin, self.replay_buffer))
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     @property
     def lifetime_steps(self) -> int:
-        """Timesteps over the model's whole life, those of earlier calls of ``learn`` included."""
+        """Timesteps over the model's whole life, including those of earlier calls of ``learn``."""
         return self._steps_of_earlier_learns + self.num_timesteps
 
     def refits_due(self, before: int, now: int) -> int:
-        """The number of fits that are due for the steps after ``before``, up to ``now``."""
+        """The number of fits that are due for the vectorised steps after ``before``, up to ``now``."""
         return due(self.refit_growth, before, now)
 
     @property
     def fits_per_rollout(self) -> float:
-        """The maximum number of fits after a rollout, whatever is due."""
+        """The maximum number of fits after a rollout."""
         steps: float | None = self.predictor_gradient_steps
         if steps is None:
-            # One fit for a base algorithm that does not train at all.
+            # At least one, for a base algorithm that does not train at all.
             steps = max(1, self.gradient_steps) if self.refit_growth == 0 <= self.gradient_steps else -1
         return steps if steps >= 0 else math.inf
 
@@ -157,7 +158,7 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         super().set_env(env, force_reset)
-        self._connect(cast(KnowledgeMixin, self.replay_buffer))
+        self._set_label_source(cast(KnowledgeMixin, self.replay_buffer))
 
     # ---------------------------------------------------------------- saving
 
@@ -181,22 +182,22 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         if not isinstance(load_path_or_dict, dict):
             _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
         if exact_match and "predictor" not in load_path_or_dict:
-            # Not a ValueError: `load` takes that for an old file and buries it under a KeyError.
+            # Not a ValueError, which `load` would take for a sign of an old file and turn into a KeyError.
             raise TypeError(
                 f"These parameters hold no AP predictor, so a plain algorithm saved them: build {type(self).__name__} "
                 "with the same settings and call `model.set_parameters(path, exact_match=False)` to go on from them."
             )
-        own = settings_of(self.predictor.optimizer)
+        own_settings = settings_of(self.predictor.optimizer)
         check_same_optimizer(self.predictor.optimizer, load_path_or_dict)
         super().set_parameters(load_path_or_dict, exact_match, device)
-        # The file brings the optimizer's running averages; its settings are those of this model.
-        for group, settings in zip(self.predictor.optimizer.param_groups, own, strict=True):
+        # The file provides the optimizer's running averages; learning rate and so on are those of this model.
+        for group, settings in zip(self.predictor.optimizer.param_groups, own_settings, strict=True):
             group.update(settings)
 
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
-        own = self.replay_buffer
+        previous = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, own
+        loaded, self.replay_buffer = self.replay_buffer, previous  # which is kept if the check fails
         check_fits(cast(Any, loaded), self)
         self.replay_buffer = loaded
-        self._connect(cast(KnowledgeMixin, loaded))
+        self._set_label_source(cast(KnowledgeMixin, loaded))

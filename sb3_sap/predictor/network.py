@@ -102,7 +102,7 @@ class PermissibilityPredictor(BaseModel):
             weight_decay=weight_decay,
             **self.optimizer_kwargs,
         )
-        # Only a fit needs training mode; all else queries E, sometimes for a single state.
+        # Only a fit needs training mode; everything else queries E, sometimes for a single state.
         self.set_training_mode(False)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class PermissibilityPredictor(BaseModel):
         return self.extract_features(obs, self.features_extractor)
 
     def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """(n,) logits of (n, action_dim) actions; above zero means permissible."""
+        """(n,) logits of (n, action_dim) scaled actions; above zero means permissible."""
         if isinstance(self.action_space, spaces.Discrete):
             actions = F.one_hot(actions.flatten().long(), int(self.action_space.n))
         # A float64 action space brings float64 actions.
@@ -173,14 +173,14 @@ class PermissibilityPredictor(BaseModel):
         """Mini-batches of n rows."""
         starts = list(range(0, n, self.batch_size))
         if self._normalises_batches and n % self.batch_size == 1 and len(starts) > 1:
-            starts.pop()  # a row on its own has no variance: it goes with those before it
+            starts.pop()  # a single row has no variance, so it joins the batch before it
         for start, end in zip(starts, [*starts[1:], n], strict=True):
             yield slice(start, end)
 
     @th.no_grad()
     @flush_denormals()
     def recall(self, dataset: LabelledActions) -> tuple[float, float]:
-        """Share of each class that E gets right, (non-permissible, permissible): their mean is balanced accuracy."""
+        """E's recall of each class, (non-permissible, permissible); their mean is the balanced accuracy."""
         obs, actions, labels = self._to_tensors(dataset)
         correct = ((self(obs, actions) > 0) == (labels > 0.5)).cpu().numpy()
         permissible = dataset.labels > 0.5
@@ -204,7 +204,12 @@ def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None
 def candidate_logits(
     predictor: PermissibilityPredictor, features: th.Tensor, candidates: np.ndarray[Any, Any]
 ) -> FloatArray:
-    """E's (m, n) logits of (m, n, action_dim) candidates in m states of (m, features_dim) features, in one call."""
+    """E's logits of n candidates in each of m states, in one call.
+
+    :param features: (m, features_dim)
+    :param candidates: (m, n, action_dim), scaled
+    :return: (m, n)
+    """
     m, n, dim = candidates.shape
     actions = th.as_tensor(candidates.reshape(m * n, dim), device=features.device)
     logits = predictor.logits(features.repeat_interleave(n, dim=0), actions)

@@ -14,15 +14,15 @@ def settings_of(optimizer: Optimizer) -> list[dict[str, Any]]:
 
 
 def check_same_optimizer(optimizer: Optimizer, saved: Mapping[str, Any]) -> None:
-    """Refuses saved parameters of another optimizer.
+    """Checks that saved parameters are those of the same optimizer class.
 
     :param saved: as in a model file, with the key ``"predictor.optimizer"`` if there was a predictor
-    :raise TypeError: with one sentence
+    :raise TypeError: if they belong to another optimizer
     """
     own = settings_of(optimizer)[0].keys()
     for group in saved.get("predictor.optimizer", {"param_groups": []})["param_groups"]:
         names = group.keys() - {"params"}
-        if names - own and own - names:  # one alone is another version of torch
+        if names - own and own - names:  # names on one side only come from another version of torch
             raise TypeError(
                 f"These parameters hold the state of another optimizer than the predictor's "
                 f"{type(optimizer).__name__}: build the model with the `predictor_kwargs` of the saved one."

@@ -10,23 +10,25 @@ from typing import Any
 def due(growth: float, before: int, now: int, every: int = 1, max_gap: float = math.inf) -> int:
     """The number of updates due after the count ``before``, up to ``now``.
 
-    At every count at first, then, once a fraction of ``growth`` is more than one count, as their logarithm.
+    At first an update is due at every count. Once ``growth`` times the count exceeds one, the gaps between updates are
+    that long, and the number of updates grows as the logarithm of the count.
 
     :param growth: the fraction, from 0 (at every count) to below 1
     :param every: keep only every n-th update
     :param max_gap: maximum gap between two updates, in counts
     """
 
-    def until(count: int) -> int:
+    def total(count: int) -> int:
+        # Up to this count the gaps grow; after it, they are `max_gap`.
         growing = min(count, max_gap / growth) if growth else count
         updates = growing if growth * growing <= 1 else (1 + math.log(growth * growing)) / growth
         return int(updates + (count - growing) / max_gap) // every
 
-    return until(now) - until(before)
+    return total(now) - total(before)
 
 
 def check_growth(model: Any, name: str) -> None:
-    """Refuses a setting of a model that is not such a fraction."""
+    """Raises a ``ValueError`` for a setting of a model that is not a fraction from 0 to below 1."""
     value = getattr(model, name)
     if not (isinstance(value, Real) and 0 <= float(value) < 1):
         raise ValueError(f"`{name}` is a fraction from 0 to below 1, but is {value!r}.")

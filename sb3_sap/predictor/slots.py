@@ -14,7 +14,7 @@ class ClassSlots:
     oldest of the other class, which is then the larger one.
 
     :param capacity: number of slots
-    :param least: number of tuples below which a class still grows, at most half of the capacity
+    :param least: number of tuples below which a class still grows in a full store, at most half of the capacity
     """
 
     def __init__(self, capacity: int, least: int = 1):
@@ -42,7 +42,7 @@ class ClassSlots:
         return int(self._slots[label, position])
 
     def _append(self, label: int, slot: int) -> int:
-        # Only classes that never wrapped, or were just sorted by age, grow: the newest tuple is also the last.
+        # Only a class that never wrapped around, or was sorted by age since, grows: its newest tuple is also the last.
         self._slots[label, self.counts[label]] = slot
         self.counts[label] += 1
         return slot

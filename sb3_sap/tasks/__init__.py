@@ -1,4 +1,4 @@
-"""AP functions of well-known environments beyond lane keeping, each with its argument, or said to be a heuristic.
+"""AP functions of well-known environments beyond lane keeping, each with an argument for it, or marked as a heuristic.
 
 Any of them is given to a guided algorithm by its name, ``ap_function="sb3_sap.tasks.mountain_car_continuous"``. They
 use what the environments return by default, unless their docstring names an option.

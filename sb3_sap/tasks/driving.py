@@ -11,21 +11,22 @@ from sb3_sap.common.arrays import BoolArray, FloatArray
 
 Array = np.ndarray[Any, Any]
 
+#: Distance to the parking place within which a car may have to turn away from it to get in, in units of 100 m.
 GOAL_RADIUS = 0.1
-"""Distance to the parking place within which a car may have to turn away to get in, in units of 100 m."""
+#: Deceleration a little below what the car can brake with, m/s².
 BRAKING = 4.0
-"""m/s², a little less than the car can brake with."""
 
+#: Units of x, y, vx and vy in the highway's observation: m, m, m/s and m/s.
 SCALES = np.array([100.0, 12.0, 20.0, 20.0], dtype=np.float32)
-"""m, m, m/s and m/s that one unit of x, y, vx and vy is in the highway's observation."""
+#: Distances between the middles of two cars, along and across the road, below which they may touch, m (a car is 5 by
+#: 2 m).
 CAR_LENGTH, CLEARANCE = 6.0, 3.0
-"""m between the middles of two cars, along and to the side, below which they may touch: a car is 5 by 2 m."""
+#: Times ahead at which the positions of all cars are compared, s.
 AHEAD = np.linspace(0, 3, 13, dtype=np.float32)
-"""s ahead at which it is looked where everybody will be."""
+#: Lateral positions of the edges of the road with three lanes, m.
 LEFT_EDGE, RIGHT_EDGE = -2.0, 10.0
-"""m, where the road of three lanes ends."""
+#: Time to the edge at the present lateral speed, below which moving faster towards it is a mistake, s.
 EDGE_TIME = 1.0
-"""s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
 
 
 def parking(obs: Mapping[str, Array], actions: Array, next_obs: Mapping[str, Array]) -> BoolArray:
@@ -34,7 +35,7 @@ def parking(obs: Mapping[str, Array], actions: Array, next_obs: Mapping[str, Arr
 
     *Heuristic.* Steering and pedal are both judged, through the speed at which the distance shrinks: every step costs,
     and nothing is gained by coming later. But a car may have to drive a bend to come in at the right angle; within
-    `GOAL_RADIUS`, where that is the rule, nothing is said. Nor is anything of a car that drives away too fast to stop.
+    `GOAL_RADIUS`, where that is common, no action is labelled False; nor is one of a car that is too fast to stop.
 
     :param obs: of highway-env's KinematicsGoal with its default scales: "achieved_goal" and "desired_goal" are
         (n, 6): x, y in units of 100 m, vx, vy of 5 m/s, cos and sin of the heading
@@ -66,8 +67,8 @@ def highway(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     """``highway-fast-v0`` with a steering wheel: False where the car is going to hit another, and the step brought them
     still nearer; or where it is about to leave the road, and the step made it faster towards the edge.
 
-    *Heuristic.* On straight courses at their present speeds two cars pass at some lateral distance, or hit: to bring
-    them nearer to each other brings nothing but the crash. But the other way may be closed by a third.
+    *Heuristic.* On straight courses at their present speeds two cars pass at some lateral distance, or collide: to
+    reduce that distance only leads to the crash. But a third car may leave no other way.
 
     :param obs: (n, cars, 5) of highway-env's Kinematics, features and ranges as in ``zoo_configs``: presence, x, y, vx,
         vy; the other cars relative to the first, whose y counts from the leftmost lane
@@ -86,7 +87,7 @@ def highway(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 
 def passing_distance(obs: Array) -> FloatArray:
-    """m to the side by which the nearest car will be passed on straight courses, within `AHEAD`; (n,).
+    """Lateral distance at which the nearest car will be passed on straight courses, within `AHEAD`; (n,) m.
 
     Infinite where nobody is passed.
     """

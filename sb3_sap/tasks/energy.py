@@ -1,4 +1,4 @@
-"""Climbing with a motor that is too weak: a mistake is to put no energy in where it is still missing."""
+"""Climbing with a motor that is too weak: it is a mistake to add no energy while energy is missing."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ Array = np.ndarray[Any, Any]
 
 # Gymnasium's mountain_car.py: per step, v' = v + push - GRAVITY·cos(3x), then x' = x + v'.
 GRAVITY = 0.0025
+#: Push of one action of ``MountainCar-v0``.
 POWER = 0.001
-"""Push of one action of ``MountainCar-v0``."""
+#: Position x at which the slope before the flag pulls back exactly as hard as that push.
 FLAG_BARRIER = math.acos(POWER / GRAVITY) / 3
-"""x, where the slope before the flag pulls back exactly as hard as that push."""
 
+#: Force along the motion below which a step counts as idle.
 IDLE = 0.1
-"""Force along the motion below which a step counts as idle."""
 
 # Gymnasium's acrobot.py: both links are 1 m and 1 kg, their centres of mass in the middle, with 1 kg·m² of inertia.
 ACROBOT_GRAVITY = 9.8
 ACROBOT_INERTIA = 1.0
+#: Lowest energy with the tip at the line, J: at rest, the first link level and the second upright.
 LEAST_ENERGY_OF_GOAL = 0.5 * ACROBOT_GRAVITY
-"""J. At rest with the first link level and the second upright, the tip is at the line and no lower energy is there."""
 
 
 def mountain_car_continuous(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
@@ -48,8 +48,8 @@ def mountain_car(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     """``MountainCar-v0``: False where the motor did not push along the motion; but to turn is no mistake where the flag
     is within reach.
 
-    The flag is within reach where pushing right from now on gets there: a constant push is a conservative force, so one
-    sum tells. A car that moves left there may push right, which is braking.
+    The flag is within reach where pushing right from now on gets there, which follows from energies: a constant push
+    is a conservative force. A car that moves left there may push right, which is braking.
 
     *Heuristic.* Every step costs 1, and a car that lacks energy gains none by braking or idling. But where it will have
     energy to spare, braking can make a swing shorter by a step or two.
@@ -64,7 +64,7 @@ def mountain_car(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 
 def flag_within_reach(obs: Array) -> BoolArray:
-    """Where pushing right from now on leads to the flag of ``MountainCar-v0``; (n,) of (n, 2)."""
+    """Where pushing right from now on leads to the flag of ``MountainCar-v0``; (n,) bool of (n, 2) observations."""
     x, v = obs[:, 0].astype(float), obs[:, 1].astype(float)
     reach: BoolArray = 0.5 * v**2 + _height_against_push(x) >= _height_against_push(FLAG_BARRIER)
     return reach
@@ -91,7 +91,7 @@ def acrobot(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 
 def acrobot_energy(obs: Array) -> FloatArray:
-    """Mechanical energy of both links, J, 0 where both are level; (n,) of (n, 6)."""
+    """Mechanical energy of both links, (n,) J, 0 where both are level at rest, of (n, 6) observations."""
     cos1, sin1, cos2, sin2, rate1, rate2 = obs.T.astype(float)
     # Of a link: at its centre of mass, and turning about it.
     speed1 = 0.25 * rate1**2

@@ -18,7 +18,7 @@ GRAVITY = 15.0
 
 
 def pendulum_height(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
-    """False where the pendulum lost height: what one would write first.
+    """False where the pendulum lost height, which is what one would write first.
 
     *Unsound.* Swinging up means falling back again and again, whatever one does.
 
@@ -55,6 +55,6 @@ def pendulum_energy(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 
 def energy(obs: Array) -> FloatArray:
-    """Energy by moment of inertia, 1/s²: 0 at rest upright, -30 at rest hanging; (n,) of (n, 3)."""
+    """Energy per moment of inertia, (n,) 1/s², of (n, 3) observations: 0 at rest upright, -30 at rest hanging."""
     value: FloatArray = 0.5 * obs[:, 2].astype(float) ** 2 + GRAVITY * (obs[:, 0].astype(float) - 1)
     return value

@@ -1,11 +1,11 @@
 """RL Zoo's commands with the algorithms and environments of this package.
 
-Nothing of rl_zoo3 is imported before one of them runs.
+rl_zoo3 is imported only when one of them runs.
 """
 
 from __future__ import annotations
 
-#: The commands, with what the help says of them.
+#: The commands, each with its line of the help.
 COMMANDS = {
     "train": "train with RL Zoo",
     "enjoy": "watch or measure what RL Zoo trained",

@@ -1,4 +1,4 @@
-"""rl_zoo3's command line: read from ``sys.argv`` alone, its values Python."""
+"""rl_zoo3's command line, which is read from ``sys.argv`` only and whose values are Python."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 import rl_zoo3.utils
 
-#: rl_zoo3's own; ours takes its name there.
+#: rl_zoo3's class, which `NamedStoreDict` replaces there.
 STORE_DICT: Any = rl_zoo3.utils.StoreDict
 
 
 class NamedStoreDict(STORE_DICT):  # type: ignore[misc]
-    """``key:value`` pairs whose values are Python; says which one is not."""
+    """``key:value`` pairs whose values are Python, with an error that names the one that is not."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
         for pair in values:
@@ -29,7 +29,7 @@ class NamedStoreDict(STORE_DICT):  # type: ignore[misc]
 
 @contextmanager
 def command_line(command: str, arguments: list[str]) -> Iterator[None]:
-    """Arguments for rl_zoo3, which reads them from ``sys.argv`` and nowhere else."""
+    """Puts arguments for rl_zoo3 into ``sys.argv``, from which alone it reads them."""
     before, sys.argv = sys.argv, [f"sb3-sap {command}", *arguments]
     try:
         yield

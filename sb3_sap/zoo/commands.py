@@ -1,4 +1,4 @@
-"""The commands: rl_zoo3's own, called with our algorithms, our ExperimentManager and our flags."""
+"""The commands: those of rl_zoo3, called with this package's algorithms, ExperimentManager and flags."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from sb3_sap.zoo.retest import RetestManager
 from sb3_sap.zoo.storages import load_study
 from sb3_sap.zoo.tuning import StudyManager
 
+#: Defaults of `--algo` and, for commands that load a run, of `--folder`.
 DEFAULT_ALGO = "ddpg_ap"
 LOGS = "logs"
-#: Base seeds where `--seed` is missing. Studies stay clear of the benchmark's seeds, and fresh seeds of a study's.
+#: Base seeds where `--seed` is missing: a study uses none of the benchmark's seeds, a retest none of the study's.
 SEEDS = {"optimize": 100, "retest": 10_000}
 
 
@@ -44,13 +45,13 @@ def run(arguments: list[str]) -> int:
     try:
         RUNNERS[arguments[0]](arguments[0], arguments[1:])
     except AssertionError as error:
-        # rl_zoo3 says so of what it does not find.
+        # rl_zoo3 raises an AssertionError for what it does not find.
         raise ValueError(str(error) or "rl_zoo3 gave up without a reason.") from error
     return 0
 
 
 def _import_environments(package: str) -> None:
-    """What rl_zoo3 does with a ``--gym-packages``, which has the module register its environments."""
+    """Imports a module of ``--gym-packages``, as rl_zoo3 does, which registers its environments."""
     try:
         importlib.import_module(package)
     except ImportError as error:
@@ -84,14 +85,14 @@ def _with_defaults(command: str, rest: list[str], given: Namespace) -> list[str]
         rest = [*rest, "-optimize"]
     seed = SEEDS.get(command)
     if given.trial_id is not None and given.storage and given.study_name:
-        # A replay is one of the seed as well.
+        # Replaying a trial includes its seed.
         trials = {t.number: t for t in load_study(given.storage, given.study_name).get_trials(deepcopy=False)}
         seed = trials[given.trial_id].user_attrs.get("seed") if given.trial_id in trials else None
     return rest if given.seed is not None or seed is None else [*rest, "--seed", str(seed)]
 
 
 def _given(rest: list[str]) -> Namespace:
-    """Those of RL Zoo's flags that have to be known beforehand."""
+    """Parses those of RL Zoo's flags that this module needs itself."""
     parser = ArgumentParser(prog="sb3-sap", usage="sb3-sap COMMAND [flags]", add_help=False, allow_abbrev=False)
     for flag in ("--algo", "--env", "--storage", "--study-name"):
         parser.add_argument(flag)

@@ -1,4 +1,4 @@
-"""The YAML file of an algorithm, and errors in it, reported in a sentence before anything is built from it."""
+"""Checks of an algorithm's YAML file, with clear errors before anything is built from it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_sap.common.functions import resolve
 from sb3_sap.common.schedules import LINEAR
 from sb3_sap.presets import RUNNER_KEYS, algorithms
 
-#: Types that the words of an annotation allow. Annotations with other words are checked by the constructor.
+#: Types allowed by each word of a type annotation. The constructor checks what has other annotations.
 KINDS: dict[str, tuple[type, ...]] = {
     "int": (int,),
     "float": (int, float),
@@ -27,25 +27,25 @@ KINDS: dict[str, tuple[type, ...]] = {
     "str": (str,),
     "None": (type(None),),
 }
-#: Given by name in YAML: classes and functions.
+#: Keys whose values are dotted names of classes or functions.
 DOTTED = ("env_wrapper", "vec_env_wrapper", "callback")
-#: May be "lin_0.001": rl_zoo3 makes a schedule of the first, our constructors of all.
+#: Keys whose values may be "lin_0.001": rl_zoo3 converts the first of them, the constructors all.
 SCHEDULES = ("learning_rate", "actor_learning_rate", "actor_permissibility_coef")
 
 
 def packaged(algo: str) -> str | None:
-    """The path of the YAML file that this package brings for an algorithm, if it does."""
+    """The path of this package's YAML file for an algorithm; ``None`` if there is none."""
     return str(resources.files("sb3_sap") / "zoo_configs" / f"{algo}.yml") if algo in algorithms() else None
 
 
 def check_algo(algo: str) -> None:
-    """Refuses an algorithm that rl_zoo3 does not know."""
+    """Checks that rl_zoo3 knows an algorithm."""
     if algo not in ALGOS:
         raise ValueError(f"`--algo` {algo!r} is unknown: {nearest(algo, ALGOS)}")
 
 
 def check_file(path: str) -> None:
-    """Refuses a file that is no mapping of environments to settings, or names an environment of ours wrongly."""
+    """Checks that a file maps environments to settings, and names this package's environments correctly."""
     file = Path(path)
     if file.suffix not in (".yml", ".yaml"):
         return  # Python, which checks itself
@@ -62,17 +62,17 @@ def check_file(path: str) -> None:
         if not isinstance(entry, Mapping):
             raise TypeError(f"{path}: the entry {name!r} must hold settings, `key: value`, but is {entry!r}.")
         if str(name).startswith("sap/") and name not in gym.registry:
-            ours = [known for known in gym.registry if known.startswith("sap/")]
-            raise ValueError(f"{path}: the environment {name!r} is unknown: {nearest(name, ours)}")
+            packaged_ids = [known for known in gym.registry if known.startswith("sap/")]
+            raise ValueError(f"{path}: the environment {name!r} is unknown: {nearest(name, packaged_ids)}")
 
 
 def evaluation_options(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of the environment in evaluations: those of the entry, but for ``laps``, whose default is used."""
+    """Options of the environment in evaluations: those of the entry, except ``laps``, which has its default."""
     return {name: value for name, value in hyperparams.get("env_kwargs", {}).items() if name != "laps"}
 
 
 def check_hyperparameters(algo: str, hyperparams: Mapping[str, Any], source: str) -> None:
-    """Refuses keys that neither rl_zoo3 nor the algorithm knows, and values of a type that cannot be."""
+    """Checks that rl_zoo3 or the algorithm knows each key, and that each value has the right type."""
     algorithm: Any = ALGOS[algo]
     parameters = inspect.signature(algorithm).parameters
     known = (set(parameters) | RUNNER_KEYS) - {"env", "seed", "verbose", "device", "tensorboard_log", "self"}
@@ -93,7 +93,7 @@ def check_hyperparameters(algo: str, hyperparams: Mapping[str, Any], source: str
 
 
 def _check_stacking(algo: str, algorithm: Any, frame_stack: Any, source: str) -> None:
-    """Refuses frames stacked on top of VecNormalize, whose raw observations, without stacks, a replay buffer holds."""
+    """Refuses frames stacked on top of VecNormalize: the replay buffer would hold its raw, unstacked observations."""
     if issubclass(algorithm, OffPolicyAlgorithm):
         raise ValueError(
             f"{source}: {algo} cannot have `normalize` and `frame_stack` together, for RL Zoo stacks what is "
@@ -105,7 +105,9 @@ def _check_stacking(algo: str, algorithm: Any, frame_stack: Any, source: str) ->
 def _check_type(key: str, value: Any, parameter: inspect.Parameter, source: str) -> None:
     if key in SCHEDULES:
         if isinstance(value, str) and not re.fullmatch(LINEAR, value):
-            raise TypeError(f'{source}: `{key}` must be a number or "lin_<number>", but is {value!r}.{_dot(value)}')
+            raise TypeError(
+                f'{source}: `{key}` must be a number or "lin_<number>", but is {value!r}.{_exponent_hint(value)}'
+            )
         return
     annotation = parameter.annotation
     words = re.findall(r"\w+", annotation if isinstance(annotation, str) else _words_of(annotation))
@@ -124,10 +126,11 @@ def _check_kinds(key: str, value: Any, kinds: list[str], source: str) -> None:
         good = isinstance(value, tuple(kind for name in kinds for kind in KINDS[name]))
     if not good:
         must = " or ".join(dict.fromkeys(kinds))
-        raise TypeError(f"{source}: `{key}` must be {must}, but is {value!r}.{_dot(value)}")
+        raise TypeError(f"{source}: `{key}` must be {must}, but is {value!r}.{_exponent_hint(value)}")
 
 
-def _dot(value: Any) -> str:
+def _exponent_hint(value: Any) -> str:
+    """How to write a number such as 1e6, which YAML reads as text; empty for other values."""
     number = isinstance(value, str) and re.fullmatch(r"\d+e[+-]?\d+", value)
     return f" YAML reads {value} as text: write it with a point, {value.replace('e', '.0e')}." if number else ""
 

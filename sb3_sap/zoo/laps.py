@@ -1,4 +1,4 @@
-"""An environment whose episodes are laps of several tracks in turn: what a study evaluates on."""
+"""An environment whose episodes are laps of several tracks in turn, on which a study evaluates."""
 
 from __future__ import annotations
 

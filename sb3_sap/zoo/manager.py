@@ -51,19 +51,19 @@ class GuidedExperimentManager(ExperimentManager):
         **kwargs: Any,
     ):
         super().__init__(args, algo, *positional, **kwargs)
-        # It looks for the configuration in its own folder, where ours are not.
+        # rl_zoo3 looks for configurations in its own folder only.
         self.config = kwargs.get("config") or packaged(algo) or self.config
-        # It takes trial 0 for no trial; a text is never false.
+        # rl_zoo3 takes trial 0 for no trial; the text "0" is not false.
         self.trial_id: Any = None if trial_id is None else str(trial_id)
         if trial_id is not None and not (self.storage and self.study_name):
             raise ValueError("`--trial-id` needs the study that it belongs to: give `--storage` and `--study-name`.")
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        # It passes wrong keys on to whatever chokes on them first.
+        # rl_zoo3 does not check keys: a wrong one fails later, wherever it is used first.
         check_file(self.config)
         hyperparams, saved = super().read_hyperparameters()
         check_hyperparameters(self.algo, hyperparams, Path(self.config).name)
-        # It evaluates on the environment without the options of its entry, where the spaces may be others.
+        # rl_zoo3 evaluates without the entry's options of the environment, where the spaces may differ.
         if not self._eval_env_kwargs_args and not self.env_kwargs:
             self.eval_env_kwargs = evaluation_options(hyperparams)
         return hyperparams, saved
@@ -71,7 +71,7 @@ class GuidedExperimentManager(ExperimentManager):
     def load_trial(
         self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True
     ) -> dict[str, Any]:
-        # It knows two kinds of storage, and answers an unknown number with an IndexError.
+        # rl_zoo3 knows two kinds of storage only, and raises an IndexError for an unknown number.
         study = load_study(storage, study_name)
         check_belongs(study, self.algo, self.env_name.gym_id)
         trials = {trial.number: trial for trial in study.trials}
@@ -84,7 +84,7 @@ class GuidedExperimentManager(ExperimentManager):
     def _preprocess_hyperparams(
         self, hyperparams: dict[str, Any]
     ) -> tuple[dict[str, Any], Callable[..., Any] | None, list[BaseCallback], Callable[..., Any] | None]:
-        # It evaluates this as Python, in which a dotted name means nothing.
+        # rl_zoo3 evaluates this as Python, in which a dotted name means nothing.
         buffer_class = hyperparams.get("replay_buffer_class")
         if isinstance(buffer_class, str) and "." in buffer_class:
             hyperparams["replay_buffer_class"] = get_class_by_name(buffer_class)
@@ -93,7 +93,7 @@ class GuidedExperimentManager(ExperimentManager):
     def _preprocess_action_noise(
         self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
     ) -> dict[str, Any]:
-        # It leaves a tuned `noise_type: None` for the constructor, which knows no such argument.
+        # rl_zoo3 passes a tuned `noise_type: None` on to the constructor, which has no such argument.
         if hyperparams.get("noise_type", "") is None:
             del hyperparams["noise_type"]
             hyperparams.pop("noise_std", None)
@@ -101,7 +101,7 @@ class GuidedExperimentManager(ExperimentManager):
         return self.explore_until_t_k(hyperparams) if self.trial_id else hyperparams
 
     def explore_until_t_k(self, hyperparams: dict[str, Any]) -> dict[str, Any]:
-        """Lets a tuned t_k be what it is without ``action_noise``: the end of the uniform random steps.
+        """Without ``action_noise``, lets the uniform random steps end at a tuned t_k.
 
         Otherwise a deterministic policy would not explore at all between them and t_k.
         """
@@ -113,7 +113,7 @@ class GuidedExperimentManager(ExperimentManager):
         return hyperparams
 
     def learn(self, model: BaseAlgorithm) -> None:
-        # It tells the first callback twice that the training ended, and the others, if interrupted, not at all.
+        # rl_zoo3 ends the training of the first callback twice and, if interrupted, that of the others never.
         if self.callbacks:
             self.callbacks = [CallbacksEndingOnce(self.callbacks)]
         super().learn(model)

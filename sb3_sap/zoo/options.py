@@ -1,4 +1,4 @@
-"""The flags that are ours, beside those of RL Zoo."""
+"""Flags of this package, beside those of RL Zoo."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 @dataclass
 class StudyOptions:
-    """What a study needs to know beyond RL Zoo's flags."""
+    """Settings of a study beyond RL Zoo's flags."""
 
     guidance_only: bool = False
     validation_tracks: list[str] = field(default_factory=list)
@@ -26,7 +26,7 @@ class StudyOptions:
 
 
 def study_parser(command: str) -> argparse.ArgumentParser:
-    """Reads our flags and leaves RL Zoo's to RL Zoo."""
+    """The parser of this package's flags; RL Zoo parses its own."""
     default = StudyOptions()
     parser = argparse.ArgumentParser(
         prog=f"sb3-sap {command}", usage=f"sb3-sap {command} [flags]", add_help=False, allow_abbrev=False
@@ -45,21 +45,25 @@ def study_parser(command: str) -> argparse.ArgumentParser:
         type=int,
         default=default.heartbeat,
         metavar="SECONDS",
-        help="a worker that gives no sign of life for twice as long is taken for dead, and its trial is run again",
+        help="a worker that gives no sign of life for twice as long is considered dead, and its trial is run again",
     )
     group.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     if command == "retest":
         group.add_argument("--best", type=int, default=default.best, help="how many of the best trials to train again")
         group.add_argument("--runs", type=int, default=default.runs, help="seeds for each of them, counted from --seed")
         group.add_argument(
-            "--tracks", nargs="+", default=[], metavar="TRACK", help="lane keeping: laps that decide, instead"
+            "--tracks",
+            nargs="+",
+            default=[],
+            metavar="TRACK",
+            help="lane keeping: compare on one lap of each of these tracks, instead",
         )
         group.add_argument("--out", type=Path, help="folder of retest.csv and retest.md")
     return parser
 
 
 def check_validation_tracks(tracks: list[str], env_id: str) -> None:
-    """Refuses tracks that the benchmark tests on, and environments that drive none."""
+    """Checks that the benchmark does not test on the tracks, and that the environment has tracks."""
     if tracks and env_id not in ENVIRONMENTS.values():
         raise ValueError(f"`--validation-tracks` needs one of {', '.join(ENVIRONMENTS.values())}, not {env_id}.")
     for track in tracks:

@@ -1,4 +1,4 @@
-"""``sb3-sap plot``: rl_zoo3's plots, into files if asked for, and the report of a study."""
+"""``sb3-sap plot``: rl_zoo3's plots, into files on request, and the report of a study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes the algorithms and their search spaces known to rl_zoo3; ``import sb3_sap`` registers the environments."""
+"""Adds the algorithms and their search spaces to rl_zoo3; ``import sb3_sap`` registers the environments."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from sb3_sap.zoo.spaces import (
     sample_crossq_params,
 )
 
-#: rl_zoo3's names of the algorithms that ours build on.
+#: rl_zoo3's names of its algorithms.
 BASES: dict[type, str] = {algorithm: name for name, algorithm in ALGOS.items()}
 
 
 def register() -> None:
-    """Adds every algorithm of this package to rl_zoo3's tables; it does no harm to do so twice."""
+    """Adds every algorithm of this package to rl_zoo3's tables; a second call changes nothing."""
     samplers: dict[str, Any] = HYPERPARAMS_SAMPLER
     converters: dict[str, Any] = HYPERPARAMS_CONVERTER
     # rl_zoo3 2.9.2 has no space for CrossQ, which it knows.
@@ -41,13 +41,15 @@ def register() -> None:
 
 @contextmanager
 def small_buffers() -> Iterator[None]:
-    """For commands that train nothing: models are loaded with buffers of next to no size.
+    """Loads models with tiny buffers, for commands that do not train.
 
     rl_zoo3 2.9.2 does so for the off-policy algorithms that `enjoy` and `record_video` know by name, and allocates the
     whole buffer of every other.
     """
     before = dict(ALGOS)
-    ALGOS.update({name: _watching(cls) for name, cls in before.items() if issubclass(cls, OffPolicyAlgorithm)})
+    ALGOS.update(
+        {name: _with_small_buffers(cls) for name, cls in before.items() if issubclass(cls, OffPolicyAlgorithm)}
+    )
     try:
         yield
     finally:
@@ -70,7 +72,7 @@ def saved_env_options() -> Iterator[None]:
         rl_zoo3.utils.create_test_env = make
 
 
-def _watching(algorithm: type[OffPolicyAlgorithm]) -> type[OffPolicyAlgorithm]:
+def _with_small_buffers(algorithm: type[OffPolicyAlgorithm]) -> type[OffPolicyAlgorithm]:
     small: dict[str, Any] = {"buffer_size": 1, "optimize_memory_usage": False}
     if issubclass(algorithm, ActionPermissibilityMixin):
         small |= {"knowledge_buffer_size": 20, "validation_fraction": 0.5, "min_per_class": 1}

@@ -1,4 +1,4 @@
-"""The best trials of a study on fresh seeds, beside the default settings: was it more than luck?"""
+"""The best trials of a study and the default settings, trained on fresh seeds to see whether the best were lucky."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from sb3_sap.zoo.storages import check_belongs, load_study, without_password
 from sb3_sap.zoo.study_report import markdown_table, shown, target_name
 from sb3_sap.zoo.tuning import StudyManager
 
+#: Name of the settings that change nothing.
 DEFAULT = "default"
 
 
 class RetestManager(StudyManager):
-    """Trains the best trials and the default anew, instead of tuning."""
+    """Trains the best trials and the default settings again, instead of tuning."""
 
     def hyperparameters_optimization(self) -> None:
         if not (self.storage and self.study_name):
@@ -51,7 +52,7 @@ class RetestManager(StudyManager):
             self.n_eval_episodes, self.n_eval_envs = len(tracks), 1
 
     def _train_all(self, settings: dict[str, dict[str, Any]], path: Path) -> pd.DataFrame:
-        """One row for each run and track; what the file holds already is not trained again."""
+        """One row for each run and track; runs that the file holds already are not repeated."""
         rows = self._rows_of(path)
         for seed in range(self.seed, self.seed + self.options.runs):  # seed by seed, so that a part is a comparison too
             for arm, hyperparams in settings.items():
@@ -97,7 +98,7 @@ class RetestManager(StudyManager):
 
 
 def arms(study: optuna.Study, algo: str, best: int) -> dict[str, dict[str, Any]]:
-    """The default and the best trials, by name: what each changes of the configuration."""
+    """What the default and the best trials change in the configuration, by name."""
     done = sorted(study_plots.completed(study), key=lambda trial: float(trial.value or 0), reverse=True)
     if not done:
         raise ValueError(f"No trial of the study {study.study_name!r} has finished.")
@@ -133,7 +134,7 @@ def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str], command:
 
 
 def _interval(interval: Sequence[float], digits: str, *matrices: Any) -> str:
-    """In brackets; nothing where some matrix has one run, which says nothing of how far runs scatter."""
+    """The interval in brackets; empty if a matrix has a single run, which does not show how much runs scatter."""
     low, high = interval
     return "" if any(len(matrix) == 1 for matrix in matrices) else f" [{low:{digits}}, {high:{digits}}]"
 

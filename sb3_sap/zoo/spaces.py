@@ -13,12 +13,14 @@ Params = dict[str, Any]
 Sampler = Callable[[optuna.Trial, int, int, Params], Params]
 Converter = Callable[[Params], Params]
 
-#: t_k is sought between these shares of a run, evenly in its logarithm. The paper's are 1/20 and 1/30.
+#: Smallest and largest t_k, as shares of a run, between which it is sampled on a log scale. The paper's are 1/20 and
+#: 1/30.
 T_K_SHARES = (1 / 60, 1 / 3)
 #: Length of a run where none is given: the paper's short one.
 DEFAULT_STEPS = 3_000
-#: Sampled as exponents of 2, because values that differ by a few make no difference.
+#: Settings sampled as powers of 2, because small differences do not matter.
 POWERS = ("n_candidates", "dataset_size")
+#: Prefix of a trial's parameters that belong to ``predictor_kwargs``.
 PREDICTOR_PREFIX = "predictor_"
 
 
@@ -29,13 +31,13 @@ def t_k_range(n_timesteps: int) -> tuple[int, int]:
 
 
 def sample_guidance(trial: optuna.Trial, n_timesteps: int) -> Params:
-    """The two parameters of Algorithm 1 itself. alpha 0 is no guidance at all, so that a study may find it useless."""
+    """The two parameters of Algorithm 1. alpha 0 is no guidance, so that a study may find guidance useless."""
     low, high = t_k_range(n_timesteps)
     return {"alpha": trial.suggest_float("alpha", 0.0, 1.0), "t_k": trial.suggest_int("t_k", low, high, log=True)}
 
 
 def sample_predictor(trial: optuna.Trial) -> Params:
-    """Settings of E and of its use."""
+    """Settings of E, of the candidates and of the auxiliary loss."""
     return {
         "actor_permissibility_coef": trial.suggest_float("actor_permissibility_coef", 0.0, 3.0),
         "alpha_low": trial.suggest_float("alpha_low", 0.0, 1.0),
@@ -71,8 +73,8 @@ def guided_converter(base: Converter) -> Converter:
 
 
 def _is_own(name: str) -> bool:
-    ours = ("alpha", "t_k", "alpha_low", "actor_permissibility_coef", *(f"{power}_pow" for power in POWERS))
-    return name in ours or name.startswith(PREDICTOR_PREFIX)
+    own = ("alpha", "t_k", "alpha_low", "actor_permissibility_coef", *(f"{power}_pow" for power in POWERS))
+    return name in own or name.startswith(PREDICTOR_PREFIX)
 
 
 def _convert_own(sampled: Params) -> Params:
@@ -88,7 +90,7 @@ def _convert_own(sampled: Params) -> Params:
 
 
 def sample_crossq_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Params) -> Params:
-    """SAC's space of rl_zoo3 without the target network, which CrossQ has not."""
+    """rl_zoo3's space of SAC without the target network, which CrossQ does not have."""
     return convert_crossq_params(
         {
             "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-4, 0.1, log=True),
@@ -101,6 +103,6 @@ def sample_crossq_params(trial: optuna.Trial, n_actions: int, n_envs: int, addit
 
 
 def convert_crossq_params(sampled: Params) -> Params:
-    """As for every other off-policy algorithm."""
+    """Converts like rl_zoo3 for every other off-policy algorithm."""
     converted: Params = convert_offpolicy_params(sampled)
     return converted

@@ -1,4 +1,4 @@
-"""Studies that several workers share: where they are kept, what is random in them, who runs which trial."""
+"""Studies that several workers share: their storage, their random seeds, and which worker runs which trial."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
-#: A trial whose workers die is tried so many times again.
+#: Number of times that a trial is run again after its worker died.
 MAX_RETRIES = 3
 #: States of trials that count for ``--max-total-trials``: what is finished, runs, or waits to be run.
 LIVE = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.RUNNING, TrialState.WAITING)
@@ -28,7 +28,7 @@ FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 def open_storage(storage: str | None, heartbeat: int | None = None) -> BaseStorage | None:
     """Opens what ``--storage`` names: a Journal file ``….log``, a proxy ``grpc://host:port``, or a database URL.
 
-    :param heartbeat: s between two signs of life of a database's workers
+    :param heartbeat: time between two signs of life of a database's workers, s
     """
     if storage is None:
         return None
@@ -80,7 +80,7 @@ def load_study(storage: str, study_name: str) -> optuna.Study:
 
 
 def check_belongs(study: optuna.Study, algo: str, env_id: str) -> None:
-    """Refuses a study of something else."""
+    """Checks that a study is one of this algorithm and environment."""
     found = study.user_attrs.get("algo", algo), study.user_attrs.get("env", env_id)
     if found != (algo, env_id):
         raise ValueError(
@@ -97,7 +97,7 @@ def reap(study: optuna.Study) -> None:
 
 
 def is_surplus(study: optuna.Study, number: int, max_total_trials: int) -> bool:
-    """Whether enough trials came before this one.
+    """Whether ``max_total_trials`` trials or more have lower numbers than this one.
 
     Two workers may each begin what both take for the last trial. Numbers are given by the storage, so that all workers
     agree which of the two is one too many.
@@ -109,7 +109,7 @@ def is_surplus(study: optuna.Study, number: int, max_total_trials: int) -> bool:
 class SeededByTrial(BaseSampler):
     """Draws every trial from a generator of its own, which the study's seed and the trial's number determine.
 
-    So a study can be repeated whichever worker runs which trial, and no two workers draw the same.
+    A study can thus be repeated, whichever worker runs which trial, and no two workers draw the same numbers.
 
     :param make: the sampler that draws, from a seed
     :param seed: of the study

@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from optuna.trial import TrialState
 
-#: Colour levels of the contour.
+#: Number of colour levels of the contour.
 LEVELS = 12
 #: Points along each axis of its grid.
 RESOLUTION = 100
-#: Trials within this share of a parameter's range are averaged: single trials are noisy.
+#: Width, as a share of a parameter's range, over which trials are averaged, because single trials are noisy.
 SMOOTHING = 0.1
-#: With fewer trials than this most of the surface is far from any of them.
+#: Number of trials below which most of the surface is far from any of them.
 FEW = 20
 
 
@@ -60,7 +60,7 @@ def contour(study: optuna.Study, x: str, y: str, target: str) -> Figure:
     axis = figure.subplots()
     points = [(t.params[x], t.params[y], float(t.value or 0)) for t in completed(study) if {x, y} <= t.params.keys()]
     xs, ys, values = (np.array(column, dtype=float) for column in zip(*points, strict=True))
-    # A failed run or two must not take all colours.
+    # A few failed runs must not take up the colour scale.
     low, high = np.quantile(values, 0.1), values.max()
     log = _is_log(study, y)
     grid_x = np.linspace(xs.min(), xs.max(), RESOLUTION)
@@ -84,13 +84,13 @@ def contour(study: optuna.Study, x: str, y: str, target: str) -> Figure:
         axis.set_yscale("log")
         axis.yaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if str(value)[0] in "25" else ""))
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set(xlabel=x, ylabel=y, title=f"{study.study_name}: {_how_much_it_says(len(points))}")
+    axis.set(xlabel=x, ylabel=y, title=f"{study.study_name}: {_reliability(len(points))}")
     axis.set_facecolor("0.7")
     figure.legend(loc="outside lower center", ncols=3, facecolor="0.7")
     return figure
 
 
-def _how_much_it_says(n_trials: int) -> str:
+def _reliability(n_trials: int) -> str:
     if n_trials >= FEW:
         return f"{n_trials} trials, the surface averages neighbours"
     return f"only {n_trials} trial{'s' * (n_trials != 1)}, too few to believe colours between them"

@@ -1,4 +1,4 @@
-"""What a trial reports to Optuna while it runs."""
+"""The evaluations that a trial reports to Optuna while it runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ReportingCallback(TrialEvalCallback):
             self._report()
 
     def _report(self) -> None:
-        # What EvalCallback does at a multiple of its frequency, now.
+        # EvalCallback evaluates at multiples of its frequency: with 1 it does so now.
         frequency, self.eval_freq = self.eval_freq, 1
         super(TrialEvalCallback, self)._on_step()
         self.eval_freq = frequency

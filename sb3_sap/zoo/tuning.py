@@ -32,7 +32,7 @@ from sb3_sap.zoo.workers import SurplusTrial, count_workers, end_with_parent, ru
 
 
 class StudyManager(GuidedExperimentManager):
-    """Adds studies to the manager."""
+    """Runs studies whose trials several workers share."""
 
     def __init__(self, *args: Any, options: StudyOptions | None = None, **kwargs: Any):
         self.options = options or StudyOptions()
@@ -51,15 +51,15 @@ class StudyManager(GuidedExperimentManager):
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         if not (eval_env and self.options.validation_tracks):
             return super().create_envs(n_envs, eval_env, no_log)
-        tour = copy.copy(self)
-        tour.options = StudyOptions()
-        tour.eval_env_kwargs = {
+        laps_manager = copy.copy(self)
+        laps_manager.options = StudyOptions()
+        laps_manager.eval_env_kwargs = {
             **self.eval_env_kwargs,
             "env_id": self.env_name.gym_id,
             "tracks": self.options.validation_tracks,
         }
-        tour.env_name = EnvironmentName(laps.ENV_ID)
-        return tour.create_envs(n_envs, eval_env, no_log)
+        laps_manager.env_name = EnvironmentName(laps.ENV_ID)
+        return laps_manager.create_envs(n_envs, eval_env, no_log)
 
     def build(self, hyperparams: dict[str, Any], seed: int) -> BaseAlgorithm:
         """A model with hyperparameters in place of the configuration's, and a seed of its own."""
@@ -124,7 +124,7 @@ class StudyManager(GuidedExperimentManager):
         return t_k_range(self.n_timesteps)[1] + 1 if issubclass(algorithm, ActionPermissibilityMixin) else 0
 
     def _create_pruner(self, pruner_method: str) -> BasePruner:
-        # rl_zoo3 counts evaluations, and would judge before the last trial is guided.
+        # rl_zoo3 counts evaluations, and would prune before every trial is guided.
         begins = max(self.guidance_begins(), self.n_timesteps // 3)
         if pruner_method == "halving":
             return SuccessiveHalvingPruner(min_resource=begins)

@@ -1,4 +1,4 @@
-"""Several workers on one study: how one of them goes on until all trials are finished, and how one command starts them.
+"""Several workers on one study: each goes on until all trials are finished, and one command may start them all.
 
 Workers are processes: threads would share the global random generators, and no trial could be repeated.
 """
@@ -20,9 +20,9 @@ from optuna.trial import TrialState
 
 from sb3_sap.zoo.storages import FINISHED, LIVE, reap
 
-#: s between two looks at the trials of other workers.
+#: Time between two looks at the trials of other workers, s.
 POLL = 2.0
-#: s that an interrupted worker may take to give up its trial.
+#: Time that an interrupted worker may take to give up its trial, s.
 PATIENCE = 10.0
 
 
@@ -50,7 +50,7 @@ def work_until(study: optuna.Study, objective: Callable[[optuna.Trial], float], 
 
 
 def count_workers(n_jobs: int, n_trials: int) -> int:
-    """How many workers ``--n-jobs`` asks for: never more than trials, and for -1 one per processor."""
+    """The number of workers for ``--n-jobs``: at most one per trial, and for -1 one per processor."""
     if n_jobs < 1 and n_jobs != -1:
         raise ValueError(f"`--n-jobs` must be at least 1, or -1 for a worker of each processor, but is {n_jobs}.")
     return max(1, min(n_trials, n_jobs if n_jobs > 0 else os.cpu_count() or 1))

@@ -1,1 +1,1 @@
-"""The reference simulator: TORCS' own physics, in process."""
+"""The reference simulator: TORCS' own physics, in the Python process."""

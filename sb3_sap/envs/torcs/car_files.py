@@ -35,13 +35,13 @@ def find_files(track: str | os.PathLike[str], car: str, installation: Installati
     car_file = installation.car(car)
     surfaces = installation.surfaces()
     if surfaces.is_file() and not installation.is_original(surfaces):
-        # It would load, with another grip on every track.
+        # TORCS would load it, with another grip on every track.
         raise ValueError(f"{surfaces}, the road surfaces, is not the one that TORCS ships: install TORCS' data again.")
     return Files(track_file, car_file, installation.category(car_category(car_file)))
 
 
 def read_car(shared: Shared, files: Files) -> Any:
-    """TORCS' handle of a car's parameters, those of its category beneath."""
+    """TORCS' handle of a car's parameters, merged with those of its category."""
     with reading():
         handles = [shared.read_parameters(str(file).encode(), READ_STANDARD) for file in (files.category, files.car)]
         if not all(handles):

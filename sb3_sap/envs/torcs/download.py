@@ -17,13 +17,14 @@ from sb3_sap.envs.torcs.installation import (
     digest,
 )
 
+#: Debian's packages.
 PACKAGES = ("torcs", "torcs-data", "libplib1")
 
 
 def install(root: Path) -> Installation:
     """Downloads the packages with apt, unpacks what is needed and puts it into ``root``, all or nothing.
 
-    :raise TorcsNotFoundError: if a tool or a package is missing, or what came is not the version that is known
+    :raise TorcsNotFoundError: if a tool or a package is missing, or the version is not the one that is known
     """
     for tool in ("apt-get", "dpkg-deb"):
         if shutil.which(tool) is None:

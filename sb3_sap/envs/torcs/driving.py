@@ -13,28 +13,28 @@ from sb3_sap.envs.lane_keeping import OBSERVATION_LIMIT, OBSERVATION_SCALE, Lane
 from sb3_sap.envs.torcs.simulator import TorcsSimulator
 from sb3_sap.envs.units import KMH
 
+#: Distances ahead of the car at which the road's curvature is observed, m.
 LOOK_AHEAD = (5.0, 10.0, 20.0, 35.0, 55.0, 80.0, 110.0, 150.0)
-"""m ahead of the car at which the road's curvature is observed."""
+#: Unit of an observed curvature, 1/m (a curve of 50 m radius).
 CURVATURE_SCALE = 0.02
-"""1/m that one unit of the observation is, a curve of 50 m radius."""
+#: Largest magnitude of an observed curvature, in those units.
 CURVATURE_LIMIT = 5.0
-"""Largest magnitude of an observed curvature, in those units."""
+#: Acceleration above what the tyres can give in any direction (about 1.5 g), m/s²: what it cannot do is impossible.
 MAX_ACCELERATION = 20.0
-"""m/s². More than the tyres can give in any direction (about 1.5 g): what it cannot do cannot be done."""
+#: Acceleration below what the tyres give on any road (about 0.3 g), m/s²: what it can do is always possible.
 SURE_ACCELERATION = 3.0
-"""m/s². Less than the tyres give on any road (about 0.3 g): what this can do is always possible."""
+#: |angle| (rad) and |trackPos| below which a car is well placed.
 SURE_ANGLE, SURE_TRACK_POS = 0.2, 0.5
-"""rad and half widths within which a car is well placed."""
+#: Time to the edge at the present lateral speed, below which moving faster towards it is a mistake, s.
 EDGE_TIME = 1.0
-"""s. Nearer to the edge than this, at the present lateral speed, going faster towards it is a mistake."""
+#: Index of half the road's width in the observation.
 HALF_WIDTH = slice(5 + len(LOOK_AHEAD), 6 + len(LOOK_AHEAD))
-"""Where the observation holds half the road's width …"""
+#: Unit of the observed half width, m.
 WIDTH_SCALE = 10.0
-"""… in units of 10 m."""
 
 
 def lateral_velocity(obs: NDArray[Any]) -> NDArray[Any]:
-    """Speed across the road, m/s, positive to the left; (n,) of (n, obs_dim)."""
+    """Speed across the road, (n,) m/s, positive to the left, of (n, obs_dim) observations."""
     angle, speed_x, speed_y = obs[:, 0], obs[:, 2] * OBSERVATION_SCALE[2] / KMH, obs[:, 3] * OBSERVATION_SCALE[3] / KMH
     return speed_y * np.cos(angle) - speed_x * np.sin(angle)  # type: ignore[no-any-return]
 
@@ -69,7 +69,7 @@ def ap_function(obs: NDArray[Any], actions: NDArray[Any], next_obs: NDArray[Any]
 
 
 def too_fast(obs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where no braking could make the car slow enough for the road ahead; (n,) of (n, obs_dim)."""
+    """Where no braking could make the car slow enough for the road ahead; (n,) bool of (n, obs_dim) observations."""
     curvature = np.abs(obs[:, 5 : 5 + len(LOOK_AHEAD)]) * CURVATURE_SCALE  # (n, points), 1/m
     speed_squared = (obs[:, 2:3] * OBSERVATION_SCALE[2] / KMH) ** 2
     holds = MAX_ACCELERATION / np.maximum(curvature, 1e-6)  # v² at which the tyres still hold the curve
@@ -78,7 +78,7 @@ def too_fast(obs: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def dawdles(obs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where a well placed car is slower than anything in sight requires; (n,) of (n, obs_dim)."""
+    """Where a well placed car is slower than anything in sight requires; (n,) bool of (n, obs_dim) observations."""
     sharpest = np.abs(obs[:, 5 : 5 + len(LOOK_AHEAD)]).max(axis=1) * CURVATURE_SCALE  # (n,), 1/m
     speed_squared = (obs[:, 2] * OBSERVATION_SCALE[2] / KMH) ** 2
     well_placed = (np.abs(obs[:, 0]) < SURE_ANGLE) & (np.abs(obs[:, 1]) < SURE_TRACK_POS)
@@ -88,7 +88,7 @@ def dawdles(obs: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 class DrivingEnv(LaneKeepingEnv):
-    """Drive as fast as the road allows (TORCS alone).
+    """Drive as fast as the road allows (TORCS only).
 
     Observation, (14,): the five of lane keeping; the road's curvature at `LOOK_AHEAD` metres, in units of
     `CURVATURE_SCALE`, positive to the left; half the road's width in units of `WIDTH_SCALE` m. Action, (2,): steering,

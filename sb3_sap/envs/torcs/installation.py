@@ -13,9 +13,11 @@ from pathlib import Path
 
 from sb3_sap.common.errors import nearest
 
+#: Folders below the root, and in them the libraries of the simulator and of the track builder.
 LIBRARIES = Path("usr/lib/x86_64-linux-gnu")
 DATA = Path("usr/share/games/torcs")
 MODULES = {"simu": LIBRARIES / "torcs/modules/simu/simuv2.so", "track": LIBRARIES / "torcs/modules/track/track.so"}
+#: Libraries that all simulations share, in the order in which they must be loaded.
 SHARED = (
     LIBRARIES / "torcs/lib/libtxml.so",
     LIBRARIES / "torcs/lib/libtgf.so",
@@ -23,10 +25,10 @@ SHARED = (
     LIBRARIES / "libplibul.so.1",
     LIBRARIES / "libplibsg.so.1",
 )
-"""In the order in which they must be loaded."""
+#: End of the errors about a missing installation.
 HOW_TO_INSTALL = "run `sb3-sap torcs install`, or `apt-get install torcs` on Debian, or set TORCS_ROOT to where it is"
+#: Debian's torcs for amd64, whose structures are known; ``checksums.txt`` has the SHA-256 of each file that is used.
 VERSION = "1.3.7+dfsg-5+b2"
-"""Debian's torcs for amd64, whose structures are known; ``checksums.txt`` has the SHA-256 of each file that is used."""
 
 
 class TorcsNotFoundError(RuntimeError):
@@ -53,7 +55,7 @@ def digest(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Installation:
-    """A TORCS that was found whole."""
+    """A complete installation of TORCS."""
 
     root: Path
 
@@ -76,7 +78,7 @@ class Installation:
         return _one_of("car", name, self.cars())
 
     def category(self, name: str) -> Path:
-        """The file of a category of cars, which cars name."""
+        """The file of a category of cars, whose name is in a car's file."""
         path = self.root / DATA / "categories" / f"{name}.xml"
         if not path.is_file():
             raise TorcsNotFoundError(
@@ -112,7 +114,7 @@ def find_installation() -> Installation:
 
 
 def check_installation(root: Path) -> Installation:
-    """Checks that everything is there and that the libraries are those whose structures are known."""
+    """Checks that all files exist and that the libraries are those whose structures are known."""
     for path in (*SHARED, *MODULES.values(), DATA / "tracks", DATA / "cars", DATA / "categories"):
         if not (root / path).exists():
             raise TorcsNotFoundError(f"TORCS under {root} is not whole, {path} is missing: {HOW_TO_INSTALL}.")

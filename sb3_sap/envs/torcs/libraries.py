@@ -19,12 +19,13 @@ from sb3_sap.envs.torcs.structures import LocalPosition
 
 _Position = ctypes.POINTER(LocalPosition)
 _Float = ctypes.POINTER(ctypes.c_float)
+#: Mode of GfParmReadFile: read the file as it is.
 READ_STANDARD = 1
-"""GfParmReadFile: read the file as it is."""
+#: Mode of GfParmMergeHandles: merge sections and parameters of both handles, and release them.
 MERGE_ALL = 15
-"""GfParmMergeHandles: sources and parameters of both, the handles released."""
 
 
+#: Locks of TORCS' parser and of the pool's creation.
 _reading = threading.RLock()
 _making = threading.Lock()
 
@@ -63,7 +64,7 @@ class Shared:
 
 
 class Private:
-    """One copy of the two libraries whose simulator and track are global variables."""
+    """A private copy of the two libraries, whose simulator and track are global variables."""
 
     def __init__(self, root: Path):
         pointer = ctypes.c_void_p

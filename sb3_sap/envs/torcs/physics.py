@@ -18,21 +18,22 @@ from sb3_sap.envs.torcs.road import Road
 from sb3_sap.envs.torcs.structures import PLACED, RUNNING, RaceStructure, SituationStructure
 from sb3_sap.envs.torcs.track_files import flatten
 
+#: One step of the physics, s.
 TICK = 0.002
-"""s, one step of the physics."""
+#: Height above the road at which a car is placed, m.
 DROP_HEIGHT = 0.2
-"""m above the road at which a car is placed."""
+#: Ticks for which the race engine lets the car come to rest with the brake on (one second).
 SETTLE_TICKS = 500
-"""The race engine lets the car come to rest with the brake on, for one second."""
+#: Damage points, written into TORCS' situation.
 MAX_DAMAGE = 10_000
+#: Skill levels, from 0 (rookie) to 3 (pro), which change the grip of the tyres.
 SKILL_LEVELS = range(4)
-"""0 rookie to 3 pro; the level changes the grip of the tyres."""
+#: Highest gear of TORCS; a car ignores gears that it lacks.
 MAX_GEAR = 8
-"""TORCS' limit; a car ignores gears that it lacks."""
+#: Largest factor of fuel and damage.
 MAX_FACTOR = 100.0
-"""Of fuel and damage."""
+#: Number of places, and ticks at each, for which files that TORCS does not ship are tried out.
 TRIAL_PLACES, TRIAL_TICKS = 40, 100
-"""Where, and how long, files that TORCS does not ship are tried out."""
 
 
 class Physics(CarReadings):
@@ -70,11 +71,11 @@ class Physics(CarReadings):
         unknown = files.unknown(installation)
         if unknown and not _trial:
             options = track, car, skill_level, fuel_factor, damage_factor, installation
-            fate = survives(lambda: Physics(*options, _trial=True).drive_everywhere())
-            if fate is not None:
+            failure = survives(lambda: Physics(*options, _trial=True).drive_everywhere())
+            if failure is not None:
                 raise ValueError(
-                    f"TORCS' own code {fate} with {' and '.join(map(str, unknown))}, which it does not ship: compare "
-                    "it with a file that it does."
+                    f"TORCS' own code {failure} with {' and '.join(map(str, unknown))}, which it does not ship: "
+                    "compare it with a file that it does."
                 )
         self._factors = float(fuel_factor), float(damage_factor)
         self._skill_level = skill_level
@@ -121,7 +122,7 @@ class Physics(CarReadings):
         self.advance(SETTLE_TICKS, PLACED)
 
     def control(self, steer: float, accelerator: float, brake: float = 0.0, clutch: float = 0.0, gear: int = 1) -> None:
-        """Sets the controls; they hold until set again, but for the throttle, which a shift cuts.
+        """Sets the controls; they hold until set again, except for the throttle, which a shift cuts.
 
         :param steer: -1 (right) to 1 (left)
         :param accelerator: 0 to 1

@@ -9,8 +9,8 @@ from typing import Any
 from sb3_sap.envs.torcs.libraries import Shared
 from sb3_sap.envs.torcs.road import Road
 
+#: Limits of a placed car: |trackPos|, and height above the road, m.
 MAX_TRACK_POS, MAX_HEIGHT = 1.0, 10.0
-"""Limits of a placed car: half widths from the axis, and m above the road."""
 
 
 def check_place(distance: float, track_pos: float, angle: float, height: float) -> None:

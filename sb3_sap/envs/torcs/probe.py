@@ -12,10 +12,10 @@ import signal
 import warnings
 from collections.abc import Callable
 
+#: Time after which a trial is given up, s.
 TIME_LIMIT = 10
-"""s after which a trial is given up."""
+#: Exit status of a trial that came to its end; TORCS ends a process with 0 or 1.
 SURVIVED = 42
-"""Exit status of a trial that came to its end; TORCS ends a process with 0 or 1."""
 
 
 def survives(trial: Callable[[], object], limit: int = TIME_LIMIT) -> str | None:

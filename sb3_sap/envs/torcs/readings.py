@@ -12,7 +12,7 @@ from sb3_sap.envs.torcs.structures import CarStructure
 
 
 class CarReadings:
-    """What TORCS' structures say of one car on one road.
+    """The state of one car on one road, read from TORCS' structures.
 
     :param road: the road on which it drives
     :param shared: the functions that TORCS' simulations share
@@ -32,7 +32,7 @@ class CarReadings:
 
     @property
     def velocity(self) -> tuple[float, float, float]:
-        """In the car's frame, m/s."""
+        """Velocity in the car's frame, m/s."""
         velocity = self._velocity
         return velocity[0], velocity[1], velocity[2]
 
@@ -71,7 +71,7 @@ class CarReadings:
 
     @property
     def engine_speed(self) -> float:
-        """rad/s."""
+        """Speed of the engine, rad/s."""
         return self.car.engine_speed  # type: ignore[no-any-return]
 
     @property

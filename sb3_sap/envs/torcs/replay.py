@@ -20,6 +20,7 @@ from sb3_sap.envs.torcs.physics import TICK, Physics
 from sb3_sap.envs.torcs.structures import PRESTART, RUNNING
 from sb3_sap.envs.units import KMH
 
+#: Columns of the controls that every trace has.
 CONTROLS = ("steer_1", "accel_1")
 
 
@@ -35,6 +36,7 @@ def _slip(simulation: Physics) -> np.float32:
     return (rear_left + rear_right) - (front_left + front_right)
 
 
+#: What is compared, by the column of a trace.
 STATES: dict[str, Callable[[Physics], Any]] = {
     "angle_rad": _angle,
     "trackPos_1": lambda simulation: simulation.track_pos,
@@ -48,10 +50,10 @@ STATES: dict[str, Callable[[Physics], Any]] = {
     "engine_rad_s": lambda simulation: simulation.engine_speed,
     "gear_1": lambda simulation: simulation.gear,
 }
-"""What is compared, by column of a trace; x and y must be there."""
+#: The columns that decide whether a row is identical; a trace must have them.
 POSITION = ("x_m", "y_m")
+#: Ticks between settling and the first row, with the brake on.
 PRESTART_TICKS = 509
-"""Ticks between settling and the first row, with the brake on."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,13 @@ class Comparison:
 
     trace: str
     rows: int
+    #: Rows whose x and y have the same bits.
     identical_rows: int
-    """Rows whose x and y have the same bits."""
     all_columns_identical_rows: int
+    #: The first row whose x or y differs.
     first_difference: int | None
-    """The first row whose x or y differs."""
+    #: Largest absolute difference in each column.
     largest_deviation: dict[str, float]
-    """Of each column."""
 
     @property
     def identical(self) -> bool:

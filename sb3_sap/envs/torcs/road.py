@@ -20,11 +20,11 @@ class Segment(NamedTuple):
     width: float  # m
 
     def along(self, to_start: float) -> float:
-        """m from the segment's start, of TORCS' own measure: m on straights, rad in curves."""
+        """Converts TORCS' measure from the segment's start (m on straights, rad in curves) to m."""
         return to_start if self.straight else to_start * self.radius
 
     def to_start(self, along: float) -> float:
-        """TORCS' own measure of m from the segment's start."""
+        """Converts m from the segment's start to TORCS' measure."""
         return along if self.straight else along / self.radius
 
 

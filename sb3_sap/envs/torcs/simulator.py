@@ -1,4 +1,4 @@
-"""TORCS behind the lane-keeping task (`sb3_sap.envs.lane_keeping.Simulator`)."""
+"""TORCS as a simulator of the lane-keeping task (`sb3_sap.envs.car.Simulator`)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from sb3_sap.envs.torcs.track_files import flatten
 from sb3_sap.envs.tracks import read_track_xml
 from sb3_sap.envs.units import KMH
 
+#: Distance of the training start before the start line, m.
 TRAINING_DISTANCE = 100.0
-"""m before the start line, where the training start is."""
+#: Names of the starts.
 STARTS = ("training", "race")
 
 
@@ -69,7 +70,7 @@ class TorcsSimulator:
         return self._state()
 
     def step(self, steering: float) -> CarState:
-        """Drive one control step, the throttle decided anew every 0.02 s."""
+        """Drive one control step; throttle, brake and gear are decided every 0.02 s."""
         simulation, throttle = self.simulation, self._throttle
         for ticks in self._periods:
             accelerator, brake, gear = throttle.controls(simulation)
@@ -78,7 +79,7 @@ class TorcsSimulator:
         return self._state()
 
     def drive(self, steering: float, pedal: float) -> CarState:
-        """Drive one control step at no default speed: pedal from -1, full brake, to 1, full throttle."""
+        """Drive one control step without holding a speed; ``pedal`` is from -1 (full brake) to 1 (full throttle)."""
         simulation, throttle = self.simulation, self._throttle
         for ticks in self._periods:
             simulation.control(steering, max(pedal, 0.0), max(-pedal, 0.0), gear=throttle.gear(simulation))

@@ -27,8 +27,8 @@ def _structure(name: str, size: int, members: dict[str, tuple[int, Any]]) -> typ
     return structure
 
 
+#: x, y, z and ax, ay, az: a pose, a velocity or an acceleration.
 Vector = ctypes.c_float * 6
-"""x, y, z and ax, ay, az: a pose, a velocity or an acceleration."""
 Wheel = _structure("Wheel", 88, {"spin": (24, ctypes.c_float)})  # rad/s
 
 TrackSegment = _structure(
@@ -45,8 +45,8 @@ TrackSegment = _structure(
         "next": (232, ctypes.c_void_p),
     },
 )
+#: Types of a segment.
 RIGHT, LEFT, STRAIGHT = 1, 2, 3
-"""Types of a segment."""
 
 TrackStructure = _structure(
     "TrackStructure",
@@ -109,8 +109,8 @@ SituationStructure = _structure(
         "cars": (56, ctypes.c_void_p),
     },
 )
+#: Race states: not started, running, and waiting for the start, in which the engine turns and the car stays.
 PLACED, RUNNING, PRESTART = 0x00, 0x01, 0x10
-"""Race states: not started, running, and waiting for the start, in which the engine turns and the car stays."""
 
 RaceStructure = _structure(
     "RaceStructure",

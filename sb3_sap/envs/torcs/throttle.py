@@ -5,24 +5,24 @@ from __future__ import annotations
 from sb3_sap.envs.torcs.physics import Physics
 from sb3_sap.envs.units import KMH
 
+#: Ticks between two decisions (50 Hz). Shifting cuts the throttle command, so the controls are written each time.
 PERIOD_TICKS = 10
-"""Ticks between two decisions, 50 Hz. Shifting cuts the throttle command, so the controls are written each time."""
+#: Throttle per km/h below the target.
 GAIN = 0.08
-"""Throttle per km/h below the target."""
+#: Throttle per km/h and second below it.
 INTEGRAL_GAIN = 0.02
-"""Throttle per km/h and second below it."""
+#: Speed above the target from which the brake helps, km/h.
 BRAKE_MARGIN = 3.0
-"""km/h above the target from which the brake helps …"""
+#: Brake per km/h above that.
 BRAKE_GAIN = 0.05
-"""… by so much per km/h."""
+#: The throttle is halved while the two rear wheels together spin so much faster than the front wheels, rad/s.
 SLIP = 5.0
-"""rad/s. While the rear wheels together spin so much faster than the front wheels, the throttle is halved."""
+#: Fractions of the engine's red line: shift up above the first, down if the lower gear stays below the second.
 SHIFT_UP, SHIFT_DOWN = 0.835, 0.7
-"""Fractions of the engine's red line: shift up above the first, down where the lower gear stays below the second …"""
+#: Minimum time between two shifts, s.
 SHIFT_TIME = 0.5
-"""… and s for which it then stays."""
+#: Time between two decisions, s: `PERIOD_TICKS` ticks.
 PERIOD = 0.02
-"""s"""
 
 
 class SpeedHolder:
@@ -36,7 +36,7 @@ class SpeedHolder:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the last drive."""
+        """Starts again in first gear, with an empty integral."""
         self._integral = 0.0  # throttle
         self._gear = 1
         self._since_shift = SHIFT_TIME
@@ -44,7 +44,8 @@ class SpeedHolder:
     def controls(self, simulation: Physics) -> tuple[float, float, int]:
         """Throttle, brake and gear for the next period."""
         lack = self.speed - simulation.velocity[0] * KMH
-        if abs(lack) < self.speed / 5:  # while it accelerates from rest, nothing is learned about the throttle needed
+        # Acceleration from rest says nothing about the throttle that holds the speed.
+        if abs(lack) < self.speed / 5:
             self._integral = min(max(self._integral + INTEGRAL_GAIN * PERIOD * lack, 0.0), 1.0)
         throttle = min(max(GAIN * lack + self._integral, 0.0), 1.0)
         front_right, front_left, rear_right, rear_left = simulation.wheel_spins

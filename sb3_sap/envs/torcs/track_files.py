@@ -13,9 +13,11 @@ from pathlib import Path
 
 from sb3_sap.envs.tracks import read_track_xml
 
+#: Declarations of external entities, what precedes the document, and references to other entities.
 ENTITY = re.compile(r'<!ENTITY\s+([\w.-]+)\s+SYSTEM\s+"([^"]*)"\s*>')
 PROLOG = re.compile(r"<\?xml.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*(\[.*?\]\s*)?>", re.DOTALL)
 OTHER_ENTITY = re.compile(r"&(?!amp;|lt;|gt;|quot;|apos;|#)[\w.-]+;")
+#: The entity that is inlined: the road surfaces.
 KEPT_ENTITY = "default-surfaces"
 
 

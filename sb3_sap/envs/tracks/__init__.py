@@ -12,7 +12,8 @@ from sb3_sap.envs.tracks.files import parse_table, read_track_xml, write_table
 from sb3_sap.envs.tracks.generate import generate_track
 from sb3_sap.envs.tracks.geometry import Piece, Segment, Track
 
-#: The paper's five tracks: TORCS' name of each, and the name that the paper calls it by.
+#: The tracks of Fig. 3: TORCS' directory name of each, and the paper's name. The paper trains on the first and tests
+#: on the rest.
 TRACKS = {
     "wheel-2": "Wheel-2",
     "eroad": "E-road",
@@ -20,11 +21,10 @@ TRACKS = {
     "g-track-3": "CG Track 3",
     "ole-road-1": "Oleth Ross Road",
 }
-"""TORCS' directory name of each track of Fig. 3, and the paper's name. It trains on the first and tests on the rest."""
 
 
 def get_track(track: str | os.PathLike[str] | Track) -> Track:
-    """Return the track that is meant.
+    """Return a track by its name, its seed or its file.
 
     :param track: a key of `TRACKS`; ``"random:SEED"`` for a generated track (``"random"`` is ``"random:0"``); the path
         of a TORCS track file (``.xml``) or of a table such as `write_table` writes; or a `Track`, returned as it is

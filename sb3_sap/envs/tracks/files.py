@@ -11,17 +11,17 @@ from pathlib import Path
 
 from sb3_sap.envs.tracks.geometry import Segment, Track
 
+#: Columns of the table. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the other columns.
 COLUMNS = ("type", "length_m", "radius_m", "end_radius_m", "turn_deg", "steps")
-"""The table's columns. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the others."""
 
+#: Maximum number of steps of a segment. TORCS' own have a few hundred at most; each takes memory and time.
 MAX_STEPS = 10_000
-"""Steps that a segment may be cut into. TORCS' own tracks have at most a few hundred; each takes memory and time."""
 
+#: Units of length and angle in track files, in m or rad.
 UNITS = {"m": 1.0, "km": 1000.0, "cm": 0.01, "mm": 0.001, "ft": 0.304801, "deg": math.pi / 180, "rad": 1.0}
-"""Units of length and angle in track files, in m and rad."""
 
+#: What newer and older files call the list of segments.
 SEGMENT_LISTS = ("Track Segments", "segments")
-"""What newer and older files call the list of segments."""
 
 
 def parse_table(lines: Iterable[str], name: str) -> Track:
@@ -95,7 +95,7 @@ def _xml_segment(section: ElementTree.Element, step_length: float | None, path: 
     numbers = {renamed[name]: value for name, value in found.items() if name in renamed}
     place = f"{path}, segment {section.get('name')!r}"
     segment = _segment("" if kind is None else kind.get("val", ""), numbers, place)
-    # A number of steps goes before a length of steps, and the segment's before the track's.
+    # A number of steps takes precedence over a length of steps, and the segment's length over the track's.
     steps = found.get("profil steps", 1)
     step_length = found.get("profil steps length", step_length)
     if steps == 1 and step_length:

@@ -8,16 +8,16 @@ import numpy as np
 
 from sb3_sap.envs.tracks.geometry import Segment, Track
 
+#: Width of the road, m, as of Wheel-2.
 WIDTH = 12.0
-"""m, as Wheel-2."""
+#: Minimum and maximum number of corners of the polygon.
 CORNERS = (8, 14)
-"""Fewest and most corners of the polygon."""
+#: Distance from the polygon's middle to a corner, m.
 CORNER_DISTANCE = (150.0, 450.0)
-"""m from the polygon's middle to a corner."""
+#: Radii of the curves, m. With a steering lock of 21° and a wheelbase of 5 m, a car can turn at 13 m.
 MIN_RADIUS, MAX_RADIUS = 25.0, 120.0
-"""m, of the curves. A steering lock of 21° at a wheelbase of 5 m turns on 13 m."""
+#: Length that every straight keeps between the curves at its ends, m.
 MIN_STRAIGHT = 10.0
-"""m that every straight keeps between the curves at its ends."""
 
 
 def generate_track(seed: int) -> Track:

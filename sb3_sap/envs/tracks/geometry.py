@@ -10,8 +10,8 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
+#: Largest turn of a piece, rad. Longer arcs are laid as several pieces, so that places along a piece are unambiguous.
 MAX_PIECE_TURN = math.pi / 2
-"""rad. Longer arcs are laid as several pieces, so that the place along a piece is never ambiguous."""
 
 
 class Segment(NamedTuple):

@@ -101,7 +101,7 @@ def tools():
     """The site, and tests with the plugins that they need."""
     for module in (
         ["sphinx", "-q", "-W", "--keep-going", "-b", "html", ROOT / "docs", "site"],
-        ["pytest", "-q", "-n", "1", "-p", "no:cacheprovider", ROOT / "tests" / "test_knowledge.py"],
+        ["pytest", "-q", "-n", "1", "-p", "no:cacheprovider", ROOT / "tests" / "predictor" / "test_knowledge.py"],
     ):
         subprocess.run([sys.executable, "-m", *map(str, module)], check=True)
 

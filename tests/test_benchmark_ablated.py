@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from test_exploration import StubPredictor, above
+from stubs import StubPredictor, above
 from toy import GUIDED, Line, build
 
 from sb3_sap.benchmark.ablated import DDPGAPProposed, DDPGAPUnbalanced, KilometresPerHour, TorcsKeras, UnbalancedFit

@@ -3,8 +3,9 @@ import re
 import numpy as np
 import pytest
 import toy
+from toy import GUIDED, Line, build
 
-from sb3_sap import ActionPermissibility
+from sb3_sap import DDPGAP, ActionPermissibility
 from sb3_sap.common.functions import resolve
 from sb3_sap.permissibility import labels_from_infos, query_labels
 
@@ -125,3 +126,44 @@ def test_info_without_a_label_names_both_ways_out():
 def test_info_label_must_be_bool(label):
     with pytest.raises(TypeError, match=r'`info\["permissible"\]` must be a bool, but is'):
         labels_from_infos([{"permissible": label}])
+
+
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_no_ap_function_anywhere(algorithm):
+    model = build(algorithm, Line(labels=False))
+    with pytest.raises(ValueError, match=r"^There is no AP function: .* Pass `ap_function=`"):
+        model.learn(100)
+    assert model.num_timesteps == 1
+
+
+def returns(value):
+    return lambda obs, actions, next_obs: value
+
+
+@pytest.mark.parametrize(
+    ("ap_function", "error", "message"),
+    [
+        (lambda obs, actions, next_obs: 1 / 0, RuntimeError, "^`ap_function` <lambda> raised ZeroDivisionError"),
+        (lambda obs, action: True, RuntimeError, "^`ap_function` <lambda> raised TypeError.*batches"),
+        (
+            returns(np.array([[True]])),
+            ValueError,
+            r"returned an array of shape \(1, 1\) for 1 actions, but must .*\(1,\)",
+        ),
+        (returns(True), ValueError, r"returned an array of shape \(\) for 1 actions, but must return shape \(1,\)"),
+        (returns(np.array([1])), TypeError, "returned values of type int64, but must return bool"),
+        (returns(np.array([np.nan])), TypeError, "returned NaN, but must return bool"),
+        (returns(None), TypeError, "returned values of type object, but must return bool"),
+    ],
+)
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_ap_function_that_does_not_label(algorithm, ap_function, error, message):
+    model = build(algorithm, ap_function=ap_function)
+    with pytest.raises(error, match=message):
+        model.learn(100)
+    assert model.num_timesteps == 1
+
+
+def test_a_wrapper_that_labels_with_numbers():
+    with pytest.raises(TypeError, match=r'^`info\["permissible"\]` must be a bool, but is 1\.$'):
+        build(DDPGAP, ActionPermissibility(Line(), lambda obs, action, next_obs: 1)).learn(100)

@@ -4,13 +4,10 @@ import json
 
 import gymnasium as gym
 import numpy as np
-import pandas as pd
 import pytest
-from rich.console import Console
 
 from sb3_sap import DDPGAP
 from sb3_sap.benchmark.paper import TABLE_2, TEST_TRACKS, paper_score
-from sb3_sap.cli.demo import TrainingLog, results_table
 from sb3_sap.envs import get_track
 from sb3_sap.envs.car import STEERING_LOCK
 from sb3_sap.evaluation.laps import LapResult, drive_lap, lap, lap_env, write_results
@@ -85,24 +82,6 @@ def test_papers_totals_give_the_scores_that_are_quoted():
     cells = TABLE_2[15_000]["ddpg_ap"]
     scores = [round(paper_score(track, cells[track].total_reward), 3) for track in TEST_TRACKS]
     assert scores == [0.940, 0.950, 0.950, 0.967]
-
-
-def test_table_shows_the_papers_row():
-    console = Console(width=150, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(results_table([LapResult("eroad", False, 0.5, -10.0, -0.001, 7)], "ddpg", 3_000))
-    text = console.export_text()
-    assert "E-road" in text
-    assert "50.0%" in text
-    assert "17.6%" in text  # the paper's DDPG
-
-
-def test_training_log_has_a_row_for_every_step():
-    log = TrainingLog()
-    DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0", laps=None), seed=0, learning_starts=10).learn(60, callback=log)
-    table = pd.DataFrame(log.rows)
-    assert list(table["step"]) == list(range(1, 61))
-    assert (table.loc[table["off_track"], "reward"] == -200).all()
-    assert table["off_track"].any()
 
 
 def test_a_road_may_be_driven_again():

@@ -7,76 +7,13 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import sb3_contrib
-import stable_baselines3
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
+from stubs import Constant, StubPredictor, above, deny, guided, never, sample
 from toy import GUIDED, Line, build, nearby
 
-from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, SACAP, TD3AP, TQCAP, CrossQAP
-from sb3_sap.guidance.candidates import stratified_candidates
-
-
-class StubPredictor:
-    """E with a rule (obs, actions) -> logits, that counts what it is asked."""
-
-    def __init__(self, rule, fitted=True):
-        self.rule, self.fitted = rule, fitted
-        self.asked = []  # number of rows of each call
-
-    def features(self, obs):
-        return obs
-
-    def logits(self, features, actions):
-        self.asked.append(len(actions))
-        return self.rule(features, actions)
-
-    def fit(self, dataset):
-        return 0.0
-
-    def recall(self, dataset):
-        return 1.0, 1.0
-
-
-class Constant(ActionNoise):
-    def __init__(self, value):
-        self.value, self.calls = value, 0
-
-    def __call__(self):
-        self.calls += 1
-        return np.array([self.value], dtype=np.float32)
-
-
-def above(border):
-    return lambda obs, actions: actions[:, 0] - border
-
-
-def never(obs, actions):
-    raise AssertionError("E must not be consulted here")
-
-
-def deny(obs, actions):
-    return -th.ones(len(actions))
-
-
-def guided(actor, rule, *, alpha=1.0, obs=None, n_candidates=4, fitted=True, algorithm=DDPGAP, env=None, **settings):
-    """A model past t_k whose actor answers ``actor`` (env units) and whose E follows ``rule``."""
-    model = build(algorithm, env, alpha=alpha, alpha_low=alpha, n_candidates=n_candidates, **settings)
-    model.predictor = StubPredictor(rule, fitted)
-    model.predict = lambda obs, deterministic: (np.array(actor, dtype=model.action_space.dtype), None)
-    model.set_logger(Logger(None, []))
-    model._last_obs = np.zeros((len(actor), 2), np.float32) if obs is None else np.array(obs, np.float32)
-    model._last_original_obs = model._last_obs
-    model._previous = [None] * len(actor)
-    model.num_timesteps = 10_000
-    return model
-
-
-def sample(model, noise=None):
-    return model._sample_action(model.learning_starts, noise, len(model._last_obs))
+from sb3_sap import DDPGAP, DDPGAPCE2
 
 
 @pytest.mark.parametrize("steps_taken", [10, 19])
@@ -269,45 +206,6 @@ def test_predict_is_the_actor_alone():
     np.testing.assert_allclose(model.predict(obs)[0], expected, atol=1e-6)
 
 
-# ---------------------------------------------------------------- A_st
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_one_candidate_per_stratum_in_each_dimension(dim):
-    low = np.float32([[-1] * dim, [0] * dim])
-    high = np.float32([[1] * dim, [10] * dim])
-    candidates = stratified_candidates(np.random.default_rng(0), low, high, 16)
-    assert candidates.shape == (2, 16, dim)
-    assert candidates.dtype == np.float32
-    strata = np.floor((candidates - low[:, None]) / (high - low)[:, None] * 16)
-    np.testing.assert_array_equal(np.sort(strata, axis=1), np.broadcast_to(np.arange(16)[:, None], (2, 16, dim)))
-
-
-def test_dimensions_and_rows_are_paired_at_random():
-    zeros = np.zeros((2, 2), np.float32)
-    candidates = stratified_candidates(np.random.default_rng(0), zeros, zeros + 1, 1000)
-    for row in candidates:
-        assert abs(np.corrcoef(row.T)[0, 1]) < 0.13  # 4 standard deviations
-    assert abs(np.corrcoef(candidates[0, :, 0], candidates[1, :, 0])[0, 1]) < 0.13
-
-
-def test_candidates_are_uniform_within_the_bounds():
-    low, high = np.float32([[-0.3]]), np.float32([[0.1]])
-    rng = np.random.default_rng(0)
-    draws = np.concatenate([stratified_candidates(rng, low, high, 4).ravel() for _ in range(2000)])
-    assert low <= draws.min() < -0.299
-    assert 0.099 < draws.max() <= high
-    assert np.mean(draws) == pytest.approx(-0.1, abs=0.001)
-    # Each tenth of the interval, across the borders of the quarters, holds a tenth: 800, standard deviation < 27.
-    counts, _ = np.histogram(draws, bins=10, range=(-0.3, 0.1))
-    assert counts == pytest.approx([800] * 10, abs=108)
-
-
-def test_an_interval_of_one_point_gives_that_point():
-    point = np.float32([[0.125]])
-    assert (stratified_candidates(np.random.default_rng(0), point, point, 5) == point).all()
-
-
 # ---------------------------------------------------------------- whole runs
 
 
@@ -340,82 +238,6 @@ def test_t_k_is_counted_over_several_short_learns():
         model.learn(8)
     model.learn(8, reset_num_timesteps=False)
     assert model.action_noise.calls == 20
-
-
-def tensors(model):
-    """Everything a model has learned, by name."""
-    found = {}
-    for name, state in model.get_parameters().items():
-        if name.startswith("predictor"):
-            continue
-        if "optimizer" in name:
-            for index, entry in state["state"].items():
-                found |= {f"{name}.{index}.{key}": value for key, value in entry.items()}
-        else:
-            found |= {f"{name}.{key}": value for key, value in state.items()}
-    return found
-
-
-def assert_same_to_the_bit(one, other):
-    states = tensors(one), tensors(other)
-    assert states[0].keys() == states[1].keys()
-    for name, value in states[0].items():
-        assert th.equal(value, states[1][name]), name
-    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
-        a, b = (getattr(m.replay_buffer, name) for m in (one, other))
-        np.testing.assert_array_equal(a, b, err_msg=name)
-
-
-def three():
-    return DummyVecEnv([Line] * 3)
-
-
-# Under VecNormalize it equals a base that is given the true last observations: tests/test_vec_envs.py.
-@pytest.mark.parametrize("make_env", [Line, three], ids=["one", "three"])
-@pytest.mark.parametrize("algorithm", [DDPG, DDPGAP])
-def test_unguided_it_equals_ddpg_to_the_bit(algorithm, make_env):
-    def noise():
-        return NormalActionNoise(np.zeros(1), 0.3 * np.ones(1))
-
-    runs, torch_states = [], []
-    for cls in (stable_baselines3.DDPG, algorithm):
-        extra = {"alpha": 0.0, "t_k": 1000} if cls is DDPGAP else {}
-        runs.append(build(cls, make_env(), action_noise=noise(), **extra).learn(150))
-        torch_states.append(th.get_rng_state())
-    assert_same_to_the_bit(*runs)
-    # DDPG's targets have no noise, so torch's generator shows up in no weight; in other algorithms it would.
-    assert th.equal(*torch_states)
-    if algorithm is DDPGAP:
-        assert runs[1].predictor.fitted
-
-
-BASES = {
-    TD3AP: stable_baselines3.TD3,
-    SACAP: stable_baselines3.SAC,
-    TQCAP: sb3_contrib.TQC,
-    CrossQAP: sb3_contrib.CrossQ,
-}
-
-
-@pytest.mark.parametrize(("algorithm", "base"), BASES.items(), ids=[algorithm.__name__ for algorithm in BASES])
-def test_unguided_every_algorithm_equals_its_base_to_the_bit(algorithm, base):
-    plain = build(base).learn(150)
-    unguided = build(algorithm, alpha=0.0, t_k=10).learn(150)
-    assert_same_to_the_bit(plain, unguided)
-    assert unguided.predictor.fitted
-
-
-@pytest.mark.parametrize("algorithm", GUIDED)
-def test_same_seed_same_bits_and_guidance_makes_a_difference(algorithm):
-    settings = {"alpha_low": 0.9, "action_noise": Constant(0.0)}
-    one, same = (build(algorithm, **settings).learn(150) for _ in range(2))
-    assert_same_to_the_bit(one, same)
-    for name, value in one.predictor.state_dict().items():
-        assert th.equal(value, same.predictor.state_dict()[name])
-    unguided = build(algorithm, **(settings | {"alpha": 0.0})).learn(150)
-    assert not np.array_equal(one.replay_buffer.actions, unguided.replay_buffer.actions)
-    other = build(algorithm, seed=2, **settings).learn(150)
-    assert not np.array_equal(one.replay_buffer.actions, other.replay_buffer.actions)
 
 
 def test_with_a_constraint_the_candidates_come_from_its_interval():

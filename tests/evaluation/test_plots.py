@@ -4,15 +4,11 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_viewer import eastward
 from toy import Line, build
 
 from sb3_sap import DDPGAP, DQNAP
-from sb3_sap.envs.viewer import LINE
 from sb3_sap.evaluation.predictor_plots import permissible_probability
 from sb3_sap.plots import plot_permissibility, return_curves, save
-from sb3_sap.predictor.tensorboard import LAYOUT
 
 LINEAR = {"net_arch": []}  # E is one linear layer
 
@@ -154,46 +150,3 @@ def test_return_curves(tmp_path):
 def test_missing_monitor_files_are_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="as SB3's Monitor writes"):
         return_curves({"a": tmp_path / "nothing"})
-
-
-def red_green(pixel):
-    return "green" if pixel[1] > pixel[0] + 30 else "red" if pixel[0] > pixel[1] + 30 else "neither"
-
-
-def test_the_fan_shows_the_verdict_on_each_steering_angle():
-    # The car drives east: left is up. Permissible is steering to the left.
-    picture = draw_fan(np.repeat([0.0, 1.0], 11))
-    (row, column), ahead = middle(picture), 95  # 95 pixels are 10.6 m
-    assert red_green(picture[row - 25, column + ahead]) == "green"
-    assert red_green(picture[row + 25, column + ahead]) == "red"
-    assert tuple(picture[row, column + ahead]) == LINE  # straight ahead is what it will do
-
-
-def test_without_a_fan_nothing_changes():
-    assert np.array_equal(eastward(), draw_fan(None))
-
-
-def middle(picture):
-    return picture.shape[0] // 2, picture.shape[1] // 2
-
-
-def draw_fan(fan):
-    from sb3_sap.envs import CarState
-    from sb3_sap.envs.tracks import Segment, Track
-    from sb3_sap.envs.viewer import Viewer
-
-    viewer = Viewer(Track("straight", 12, [Segment.straight(1000), Segment.curve(1.0, 100)]))
-    return viewer.draw(CarState(0.0, 0.0, 50, 0, 0, 500.0), 0.0, fan)
-
-
-def test_tensorboard_gets_the_layout(tmp_path):
-    build(DDPGAP, tensorboard_log=str(tmp_path)).learn(100, log_interval=1)
-    [run] = tmp_path.iterdir()
-    events = EventAccumulator(str(run)).Reload()
-    config = events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
-    for category, charts in LAYOUT.items():
-        assert category.encode() in config
-        assert all(chart.encode() in config for chart in charts)
-    drawn = {tag for charts in LAYOUT.values() for _, tags in charts.values() for tag in tags}
-    # Without actor loss and evaluation, every other curve is there.
-    assert drawn - set(events.Tags()["scalars"]) == {"sap/actor_loss", "eval/mean_reward"}

@@ -88,7 +88,7 @@ def test_dict_observations():
 
 
 def test_saved_by_name_and_resolved_again(tmp_path):
-    model = build(DDPGAP, permissible_actions="test_type2.only_right").learn(20)
+    model = build(DDPGAP, permissible_actions="test_permissible_actions.only_right").learn(20)
     model.save(tmp_path / "model")
     env = Line()
     DDPGAP.load(tmp_path / "model", env=env).learn(20)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 import sb3_sap  # noqa: F401  # registers the environment
 from sb3_sap.envs import CarState, get_track
 from sb3_sap.envs.tracks import Segment, Track
-from sb3_sap.envs.viewer import ACCENT, ASPHALT, CAR, GRASS, SCALING, SIZE, Viewer
+from sb3_sap.envs.viewer import ACCENT, ASPHALT, CAR, GRASS, LINE, SCALING, SIZE, Viewer
 from sb3_sap.evaluation.environments import make_env
 
 MIDDLE = (SIZE[1] // 2, SIZE[0] // 2)
@@ -22,10 +22,14 @@ def _headless(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
 
 
+def straight_road() -> Viewer:
+    """A long straight to the east, 12 m wide."""
+    return Viewer(Track("straight", 12, [Segment.straight(1000), Segment.curve(1.0, 100)]))
+
+
 def eastward(track_pos: float = 0.0, angle: float = 0.0, steering: float = 0.0) -> NDArray[np.uint8]:
-    """A car amid a long straight to the east, 12 m wide."""
-    viewer = Viewer(Track("straight", 12, [Segment.straight(1000), Segment.curve(1.0, 100)]))
-    return viewer.draw(CarState(angle, track_pos, 50, 0, 0, 500.0), steering)
+    """A car amid that straight."""
+    return straight_road().draw(CarState(angle, track_pos, 50, 0, 0, 500.0), steering)
 
 
 def at(picture: NDArray[np.uint8], right: float = 0.0, up: float = 0.0) -> tuple[int, ...]:
@@ -155,3 +159,31 @@ def test_rendering_without_a_mode_warns() -> None:
     env.reset()
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert env.unwrapped.render() is None
+
+
+# ---------------------------------------------------------------- the fan of steering angles
+
+CENTRED = CarState(0.0, 0.0, 50, 0, 0, 500.0)
+LEFT_IS_PERMISSIBLE = np.repeat([0.0, 1.0], 11)
+"""The probability for steering from right to left."""
+
+
+def red_or_green(pixel: NDArray[np.uint8]) -> str:
+    red, green, _ = pixel.astype(int)
+    return "green" if green > red + 30 else "red" if red > green + 30 else "neither"
+
+
+def test_fan_is_green_where_steering_is_permissible_and_red_elsewhere() -> None:
+    picture = straight_road().draw(CENTRED, 0.0, LEFT_IS_PERMISSIBLE)  # the car drives east: left is up
+    (row, column), ahead = MIDDLE, 95  # 95 pixels are 10.6 m
+    assert red_or_green(picture[row - 25, column + ahead]) == "green"
+    assert red_or_green(picture[row + 25, column + ahead]) == "red"
+    assert tuple(picture[row, column + ahead]) == LINE  # straight ahead is what it will do
+
+
+def test_fan_leaves_no_trace_in_the_next_picture_without_one() -> None:
+    viewer = straight_road()
+    fans = (None, LEFT_IS_PERMISSIBLE, None)
+    before, with_fan, after = (viewer.draw(CENTRED, 0.0, fan) for fan in fans)
+    assert not np.array_equal(with_fan, before)
+    assert np.array_equal(after, before)

@@ -2,11 +2,15 @@ import copy
 import io
 import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer, RolloutBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecNormalize,
+)
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import Line, build, towards_centre
 
@@ -279,3 +283,25 @@ def test_loading_a_buffer_without_hindsight_is_refused():
     file.seek(0)
     with pytest.raises(ValueError, match=r"^The file holds a PermissibilityDictReplayBuffer, but .* uses a Perm"):
         build(DDPGAP, **goal, replay_buffer_class=HerReplayBuffer).load_replay_buffer(file)
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (lambda: DummyVecEnv([Line] * 2), "replay buffer of 2 environments, but this model has 1"),
+        (lambda: Line(high=3.0), r"whose action_space is Box\(-1.0, 3.0"),
+        (lambda: gym.wrappers.FlattenObservation(Line("dict", n_actions=None)), None),
+    ],
+)
+def test_a_replay_buffer_of_another_environment_is_refused_at_load(other, message):
+    file = io.BytesIO()
+    build(DDPGAP, other()).learn(20).save_replay_buffer(file)
+    file.seek(0)
+    model = build(DDPGAP)
+    own = model.replay_buffer
+    if message is None:  # equal spaces
+        model.load_replay_buffer(file)
+        return
+    with pytest.raises(ValueError, match=message):
+        model.load_replay_buffer(file)
+    assert model.replay_buffer is own

@@ -8,13 +8,17 @@ import subprocess
 import sys
 import time
 
+import gymnasium as gym
 import pandas as pd
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from sb3_sap import DDPGAP
+from sb3_sap.cli.demo import TrainingLog, results_table
 from sb3_sap.cli.hub import EXTRAS
 from sb3_sap.cli.main import main
+from sb3_sap.evaluation.laps import LapResult
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +111,21 @@ def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model.zip", "run.json", "training.csv"]
     command = json.loads((tmp_path / "run.json").read_text())["command"]
     assert command.endswith(f"# interrupted after {taken} steps")
+
+
+def test_table_shows_the_papers_row():
+    console = Console(width=150, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(results_table([LapResult("eroad", False, 0.5, -10.0, -0.001, 7)], "ddpg", 3_000))
+    text = console.export_text()
+    assert "E-road" in text
+    assert "50.0%" in text
+    assert "17.6%" in text  # the paper's DDPG
+
+
+def test_training_log_has_a_row_for_every_step():
+    log = TrainingLog()
+    DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0", laps=None), seed=0, learning_starts=10).learn(60, callback=log)
+    table = pd.DataFrame(log.rows)
+    assert list(table["step"]) == list(range(1, 61))
+    assert (table.loc[table["off_track"], "reward"] == -200).all()
+    assert table["off_track"].any()

@@ -5,12 +5,10 @@ import pytest
 import torch as th
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from test_exploration import StubPredictor, above, deny, guided, never, sample
+from stubs import StubPredictor, above, deny, never
 from toy import GUIDED, Line, build
 
-from sb3_sap import DDPGAP, SACAP, GuidedPolicy
-from sb3_sap.guidance.candidates import SELECTIONS, choose
-from sb3_sap.guidance.values import q_values
+from sb3_sap import DDPGAP, GuidedPolicy
 
 
 def predicting(rule, actor=0.0, env=None, **settings):
@@ -113,61 +111,3 @@ def test_the_wrapper_serves_evaluate_policy(algorithm):
     env.executed.clear()
     evaluate_policy(GuidedPolicy(model), model.get_env(), n_eval_episodes=1)
     assert (np.array(env.executed) > 0.5).all()
-
-
-# ---------------------------------------------------------------- line 11
-
-
-def test_choose():
-    candidates = np.arange(6).reshape(2, 3, 1)
-    permissible = np.array([[True, False, True], [False, True, True]])
-    scores = np.array([[1.0, 9.0, 2.0], [9.0, 3.0, 2.0]])
-    assert choose(np.random.default_rng(0), candidates, permissible, scores).tolist() == [[2], [4]]
-    drawn = [choose(np.random.default_rng(i), candidates, permissible, None).ravel().tolist() for i in range(50)]
-    assert {first for first, _ in drawn} == {0, 2}
-    assert {second for _, second in drawn} == {4, 5}
-
-
-@pytest.mark.parametrize(
-    ("selection", "low", "high"), [("nearest", 0.0, 0.02), ("most_permissible", 0.98, 1.0), ("random", 0.0, 1.0)]
-)
-def test_selection_by_name(selection, low, high):
-    scaled = sample(guided([[-0.25]] * 20, above(0), n_candidates=100, candidate_selection=selection))[1]
-    assert ((scaled > low) & (scaled <= high)).all()
-    assert (scaled.std() > 0.1) == (selection == "random")
-
-
-@pytest.mark.parametrize("algorithm", GUIDED)
-def test_highest_q_is_the_critics_choice(algorithm):
-    model = build(algorithm, alpha=1.0, alpha_low=1.0).learn(60)
-    obs, actions = th.as_tensor(np.repeat(OBS, 2, axis=0)), th.tensor([[-0.5], [0.5], [-0.5], [0.5]])
-    with th.no_grad():
-        q = q_values(model, obs, actions)
-    assert q.shape == (4,)
-    model.candidate_selection = "highest_q"
-    model.n_candidates = 50
-    model.predictor = StubPredictor(above(0))
-    model.predict = lambda obs, deterministic: (np.full((2, 1), -0.25, np.float32), None)
-    model._last_obs, model._previous, model.num_timesteps = OBS, [None] * 2, 10_000
-    scaled = model._sample_action(0, None, 2)[1]
-    grid = th.linspace(0.01, 0.99, 50)[:, None]
-    for row, action in zip(OBS, scaled, strict=True):
-        with th.no_grad():
-            q = q_values(model, th.as_tensor(np.repeat(row[None], 50, axis=0)), grid)
-            chosen = q_values(model, th.as_tensor(row[None]), th.as_tensor(action[None]))
-        assert chosen >= q.max() - (q.max() - q.min()) * 0.15 - 1e-6  # the candidates are a grid of their own
-
-
-def test_critics_statistics_stand_still():
-    model = build(GUIDED[-1]).learn(60)
-    before = {name: value.clone() for name, value in model.critic.named_buffers()}
-    assert before
-    model.policy.set_training_mode(True)
-    q_values(model, th.as_tensor(OBS), th.zeros(2, 1))
-    assert all(th.equal(value, before[name]) for name, value in model.critic.named_buffers())
-
-
-def test_an_unknown_selection_is_refused():
-    with pytest.raises(ValueError, match=r"^`candidate_selection` must be one of 'random', .* but is 'best'"):
-        build(SACAP, candidate_selection="best")
-    assert SELECTIONS[0] == "random"

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from test_save_load import assert_same, reseed
+from states import assert_same, reseed
 from toy import DISCRETE, Line, build
 
 from sb3_sap import DQNAP, QRDQNAP, GuidedPolicy

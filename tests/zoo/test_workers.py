@@ -1,0 +1,90 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from quick_runs import ENV, optimize, optuna
+
+from sb3_sap.zoo.storages import open_storage
+from sb3_sap.zoo.workers import count_workers, run_workers
+
+
+@pytest.mark.slow
+def test_trials_of_workers_side_by_side_are_those_of_one():
+    flags = ["--n-trials", "3", "--n-startup-trials", "3", "--no-optim-plots"]
+    assert optimize("--storage", "one.log", *flags) == 0
+    assert optimize("--n-jobs", "2", *flags) == 0
+    [file] = Path("logs").rglob("study.log")  # where a study is kept of which no storage was named
+    alone, together = (
+        optuna.load_study(study_name="study", storage=open_storage(str(path))).trials for path in ("one.log", file)
+    )
+    assert [(t.params, t.user_attrs["seed"], t.value) for t in together] == [
+        (t.params, t.user_attrs["seed"], t.value) for t in alone
+    ]
+    assert len({trial.user_attrs["worker"] for trial in together}) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_the_command_that_started_them(end):
+    command = [sys.executable, "-m", "sb3_sap.zoo", "optimize", "--env", ENV, "-n", "100000", "--guidance-only"]
+    command += ["--n-jobs", "2", "--storage", "study.log", "--study-name", "study"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    running = optuna.trial.TrialState.RUNNING
+
+    def trials():
+        if not Path("study.log").exists():
+            return []
+        try:
+            return optuna.load_study(study_name="study", storage=open_storage("study.log")).trials
+        except KeyError:  # the file is there, and the study not yet
+            return []
+
+    try:
+        for begun in (True, False):
+            deadline = time.monotonic() + 120
+            while (len(trials()) < 2) if begun else any(trial.state == running for trial in trials()):
+                assert time.monotonic() < deadline
+                time.sleep(0.5)
+            process.send_signal(end)
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """A worker that fails where it has two trials, and else leaves a file once its pipe is closed."""
+    Path("worker").write_text(
+        '#!/bin/sh\ncase "$*" in\n  *"--n-trials 2") exit 3;;\n  *) cat; echo "$@" > ended;;\nesac\n'
+    )
+    Path("worker").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(Path("worker").absolute()))
+
+
+def test_a_worker_that_fails_ends_the_others(stand_in):
+    with pytest.raises(RuntimeError, match="ended with exit status 3, and the others were ended"):
+        run_workers("sb3-sap optimize --seed 1 --n-jobs 2", 2, 3, ["--seed", "7"])
+    told = "-m sb3_sap.zoo optimize --seed 1 --n-jobs 2 --seed 7 --n-jobs 1 --worker --n-trials 1"
+    assert Path("ended").read_text().strip() == told
+
+
+def test_ctrl_c_ends_workers(stand_in, monkeypatch):
+    def interrupt(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_workers("sb3-sap optimize", 1, 1, [])
+    assert Path("ended").exists()
+
+
+def test_how_many_workers():
+    assert [count_workers(n_jobs, 3) for n_jobs in (1, 2, 5)] == [1, 2, 3]
+    assert count_workers(-1, 10_000) == os.cpu_count()
+    for n_jobs in (0, -2):
+        with pytest.raises(ValueError, match=f"`--n-jobs` must be at least 1, or -1 .* but is {n_jobs}"):
+            count_workers(n_jobs, 3)

@@ -39,7 +39,7 @@ PROGRAMS = {
         grid = ["--simulator", "highway", "--configurations", "linear", "--tracks", "eroad", "--out", "."]
         assert main(["benchmark", "summary", *grid]) == 0
     """,
-    "dask": "import distributed, sb3_sap.benchmark.runner",
+    "dask": "import distributed, sb3_sap.benchmark.dispatch",
     "docs": "import furo, myst_parser, sphinx.application",
     "hub": "import huggingface_sb3, sb3_sap.cli.hub",
     "tensorboard": """

@@ -20,7 +20,7 @@ from sb3_sap.common.extractors import RescaleExtractor
 from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
-from sb3_sap.permissibility import ActionPermissibility
+from sb3_sap.permissibility import ActionPermissibility, does_not_lower
 from sb3_sap.predictor.buffers import (
     KnowledgeMixin,
     PermissibilityDictReplayBuffer,
@@ -63,6 +63,7 @@ __all__ = [
     "PermissibilityReport",
     "RescaleExtractor",
     "check_permissibility",
+    "does_not_lower",
     "envs",
     "preset",
 ]

@@ -8,7 +8,8 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
-from sb3_sap.common.arrays import BoolArray, Observations, copy_observation
+from sb3_sap.common.arrays import BoolArray, FloatArray, Observations, copy_observation
+from sb3_sap.common.reward_shaping import PotentialError, RewardShaping, query_potential
 
 
 class APFunction(Protocol):
@@ -27,15 +28,27 @@ class APFunction(Protocol):
 
 
 class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
-    """Puts the label of each executed action into ``info["permissible"]``.
+    """Puts the label of each executed action into ``info["permissible"]``, and subtracts a penalty for mistakes.
+
+    The penalty is for algorithms other than those of this package, whose ``penalty=`` leaves logged returns alone. To
+    have them logged without it, put the ``Monitor`` inside: ``ActionPermissibility(Monitor(env), f, penalty=1.0)``, and
+    evaluate in an environment without this wrapper.
 
     :param env: the environment to wrap
-    :param permissible: f(s, a | s') of one step: ``permissible(obs, action, next_obs) -> bool``
+    :param permissible: f(s, a | s') of one step: ``permissible(obs, action, next_obs) -> bool``; ``None``: the
+        environment's own ``info["permissible"]``
+    :param penalty: c, subtracted from the reward of a non-permissible action
     """
 
-    def __init__(self, env: gym.Env[Any, Any], permissible: Callable[[Any, Any, Any], bool]):
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        permissible: Callable[[Any, Any, Any], bool] | None = None,
+        penalty: float = 0.0,
+    ):
         super().__init__(env)
-        if not callable(permissible):
+        self.shaping = RewardShaping(penalty)
+        if not (permissible is None or callable(permissible)):
             raise TypeError(
                 "`permissible` must be a function (obs, action, next_obs) -> bool of one step, "
                 f"but is {permissible!r}: pass the function itself."
@@ -50,9 +63,25 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         next_obs, reward, terminated, truncated, info = self.env.step(action)
-        info = {**info, "permissible": self.permissible(self._obs, action, next_obs)}
+        if self.permissible is not None:
+            info = {**info, "permissible": self.permissible(self._obs, action, next_obs)}
+        if self.shaping:
+            reward = float(reward) - self.shaping.penalty * ~labels_from_infos([info])[0]
         self._obs = copy_observation(next_obs)
         return next_obs, reward, terminated, truncated, info
+
+
+def does_not_lower(potential: Callable[[Observations], FloatArray]) -> APFunction:
+    """The AP function of a potential Φ: an action is permissible if Φ(s') >= Φ(s).
+
+    :param potential: (n,) values of n raw observations
+    """
+
+    def ap_function(obs: Observations, actions: np.ndarray[Any, Any], next_obs: Observations) -> BoolArray:
+        later, now = (query_potential(potential, o, len(actions)) for o in (next_obs, obs))
+        return np.asarray(later >= now)
+
+    return ap_function
 
 
 def query_labels(
@@ -74,6 +103,8 @@ def query_labels(
     try:
         # Copies, because a function that works in place would change what is stored and executed.
         labels = np.asarray(function(*map(copy_observation, (obs, actions, *next_obs))))
+    except PotentialError:
+        raise
     except Exception as error:
         batches = "(obs, actions, next_obs)" if next_obs else "(obs, actions)"
         raise RuntimeError(

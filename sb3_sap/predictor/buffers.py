@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_sap.common.reward_shaping import RewardShaping
 from sb3_sap.common.vec_envs import RAW_LAST, environment_layout
 from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
@@ -23,6 +26,8 @@ class KnowledgeMixin(ReplayBuffer):
 
     #: The images that the AP function gets channels last (:func:`~sb3_sap.common.vec_envs.channels_last`).
     images: tuple[str, ...] = ()
+    #: What is added to the rewards that R stores; those of the environment, which are logged, remain as they are.
+    shaping: RewardShaping
     #: Whether a transition without a label is an error; otherwise it is not added to K.
     needs_labels: bool = True
 
@@ -37,6 +42,7 @@ class KnowledgeMixin(ReplayBuffer):
         super().__init__(*args, **kwargs)
         self.knowledge = knowledge
         self.ap_function = ap_function
+        self.shaping = RewardShaping()
 
     def add(
         self,
@@ -51,8 +57,8 @@ class KnowledgeMixin(ReplayBuffer):
         for i, info in enumerate(infos):
             if RAW_LAST in info:
                 _set_row(next_obs, i, info[RAW_LAST])
+        before, after = (environment_layout(o, self.images) for o in (obs, next_obs))
         if self.ap_function is not None:
-            before, after = (environment_layout(o, self.images) for o in (obs, next_obs))
             labels = query_labels(self.ap_function, "ap_function", before, self._unscale(action), after)
         elif self.needs_labels or any("permissible" in info for info in infos):
             labels = labels_from_infos(infos)
@@ -60,6 +66,10 @@ class KnowledgeMixin(ReplayBuffer):
             labels = None
         if labels is not None:
             self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
+        if self.shaping:
+            truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
+            terminal = np.asarray(done, dtype=bool) & ~truncated
+            reward = reward + self.shaping.difference(labels, before, after, terminal)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -69,8 +79,8 @@ class KnowledgeMixin(ReplayBuffer):
         return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
 
     def __getstate__(self) -> dict[str, Any]:
-        # The AP function belongs to the model; the file holds only data.
-        return {**super().__getstate__(), "ap_function": None}  # type: ignore[dict-item]
+        # The user's functions belong to the model; the file holds only data.
+        return {**super().__getstate__(), "ap_function": None, "shaping": RewardShaping()}  # type: ignore[dict-item]
 
 
 class PermissibilityReplayBuffer(KnowledgeMixin, ReplayBuffer):
@@ -86,7 +96,34 @@ class PermissibilityNStepReplayBuffer(KnowledgeMixin, NStepReplayBuffer):
 
 
 class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
-    """The same with hindsight goals; K keeps the goals that were pursued."""
+    """The same with hindsight goals; K keeps the goals that were pursued.
+
+    A hindsight goal is labelled, penalised and shaped as if it had been pursued.
+    """
+
+    def _get_virtual_samples(
+        self, batch_indices: np.ndarray[Any, Any], env_indices: np.ndarray[Any, Any], env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        if not self.shaping:
+            return super()._get_virtual_samples(batch_indices, env_indices, env)
+        raw = super()._get_virtual_samples(batch_indices, env_indices, None)
+        obs, next_obs = (
+            {key: value.cpu().numpy() for key, value in side.items()}
+            for side in (raw.observations, raw.next_observations)
+        )
+        before, after = (environment_layout(side, self.images) for side in (obs, next_obs))
+        labels = None
+        if self.ap_function is not None:
+            actions = self._unscale(raw.actions.cpu().numpy())
+            labels = query_labels(self.ap_function, "ap_function", before, actions, after)
+        terminal = raw.dones.cpu().numpy().ravel() > 0
+        added = self.shaping.difference(labels, before, after, terminal).reshape(-1, 1)
+        rewards = self._normalize_reward((raw.rewards.cpu().numpy() + added).astype(np.float32), env)
+        return raw._replace(
+            observations={key: self.to_torch(value) for key, value in _normalized(self, obs, env).items()},
+            next_observations={key: self.to_torch(value) for key, value in _normalized(self, next_obs, env).items()},
+            rewards=self.to_torch(rewards),
+        )
 
 
 #: For each of SB3's replay buffers, the version that also fills K.
@@ -96,6 +133,11 @@ GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
     NStepReplayBuffer: PermissibilityNStepReplayBuffer,
     HerReplayBuffer: PermissibilityHerReplayBuffer,
 }
+
+
+def _normalized(buffer: ReplayBuffer, obs: dict[str, Any], env: VecNormalize | None) -> dict[str, Any]:
+    normalized: Any = buffer._normalize_obs(obs, env)
+    return dict(normalized)
 
 
 def _set_row(observations: Any, row: int, obs: Any) -> None:

@@ -10,11 +10,13 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
+from sb3_sap.common.reward_shaping import Potential, RewardShaping
 from sb3_sap.common.watching import WatchedEnvironmentMixin
-from sb3_sap.permissibility import APFunction
+from sb3_sap.permissibility import APFunction, does_not_lower
 from sb3_sap.predictor.buffers import KnowledgeMixin, check_fits
 from sb3_sap.predictor.building import make_predictor, make_replay_buffer
 from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permissibility_callback
@@ -30,7 +32,12 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     Only trains the predictor; action selection and policy updates are those of the base algorithm.
 
     :param ap_function: f(s, a | s'), an :class:`~sb3_sap.permissibility.APFunction` or its dotted name. ``None``:
-        the labels come from ``info["permissible"]``
+        the labels come from ``potential`` if there is one, else from ``info["permissible"]``
+    :param penalty: c, subtracted from the reward of a non-permissible action in the replay buffer alone: logged returns
+        and evaluations have the reward of the environment
+    :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
+        to the reward in the replay buffer alone, and without an ``ap_function`` an action is permissible if it does
+        not lower Φ
     :param knowledge_buffer_size: capacity of K
     :param validation_fraction: share of K kept for validation
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
@@ -49,6 +56,8 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         self,
         *args: Any,
         ap_function: APFunction | str | None = None,
+        penalty: float = 0.0,
+        potential: Potential | str | None = None,
         knowledge_buffer_size: int = 10_000,
         validation_fraction: float = 0.1,
         dataset_size: int = 512,
@@ -60,6 +69,8 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         **kwargs: Any,
     ):
         self.ap_function = ap_function
+        self.penalty = penalty
+        self.potential = potential
         self.knowledge_buffer_size = knowledge_buffer_size
         self.validation_fraction = validation_fraction
         self.dataset_size = dataset_size
@@ -101,7 +112,15 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
 
     def _set_label_source(self, buffer: KnowledgeMixin) -> None:
         """Sets where a replay buffer takes its labels from."""
-        buffer.ap_function = None if self.ap_function is None else resolve(self.ap_function, "ap_function")
+        potential = None if self.potential is None else resolve(self.potential, "potential")
+        own = None if potential is None else does_not_lower(potential)
+        buffer.ap_function = own if self.ap_function is None else resolve(self.ap_function, "ap_function")
+        buffer.shaping = RewardShaping(self.penalty, potential, self.gamma)
+        if self.penalty and buffer.ap_function is None and isinstance(buffer, HerReplayBuffer):
+            raise ValueError(
+                f"`penalty` = {self.penalty} needs an `ap_function` beside {type(buffer).__name__}, for a hindsight "
+                'goal has no label in `info["permissible"]`: pass the AP function itself.'
+            )
         buffer.images = self.images
         # With `permissible_actions` a model may do without labels of executed actions.
         buffer.needs_labels = getattr(self, "permissible_actions", None) is None

@@ -23,6 +23,7 @@ def knowledge_of(n):
 
 
 def fitted_predictor(knowledge, fits=40):
+    th.manual_seed(0)
     predictor = PermissibilityPredictor(OBSERVATIONS, ACTIONS, net_arch=[32], weight_decay=0.0, learning_rate=1e-2)
     for _ in range(fits):
         predictor.fit(knowledge.sample(256))

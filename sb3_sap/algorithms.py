@@ -64,31 +64,31 @@ class TD3AP(ActionPermissibilityMixin, TD3):
 class SACAP(ActionPermissibilityMixin, SAC):
     """SAC guided by action permissibility. Its stochastic policy explores without action noise."""
 
-    stochastic_policy: ClassVar[bool] = True
+    explores_without_noise: ClassVar[bool] = True
 
 
 class TQCAP(ActionPermissibilityMixin, TQC):
     """TQC guided by action permissibility."""
 
-    stochastic_policy: ClassVar[bool] = True
+    explores_without_noise: ClassVar[bool] = True
 
 
 class CrossQAP(ActionPermissibilityMixin, CrossQ):
     """CrossQ guided by action permissibility."""
 
-    stochastic_policy: ClassVar[bool] = True
+    explores_without_noise: ClassVar[bool] = True
 
 
 class DQNAP(ActionPermissibilityMixin, DQN):
     """DQN guided by action permissibility. The candidates A_st are all actions; the ε-greedy action is guided, too."""
 
-    stochastic_policy: ClassVar[bool] = True
+    explores_without_noise: ClassVar[bool] = True
 
 
 class QRDQNAP(ActionPermissibilityMixin, QRDQN):
     """QR-DQN guided by action permissibility."""
 
-    stochastic_policy: ClassVar[bool] = True
+    explores_without_noise: ClassVar[bool] = True
 
 
 #: Every algorithm by its RL Zoo name.

@@ -60,7 +60,7 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
         )
     elif accuracy >= SUFFICIENT_ACCURACY and not uses_action:
         yield (
-            f"A classifier that does not see the action foresees {without_action:.0%} of the labels, and one that "
+            f"A classifier that does not see the action predicts {without_action:.0%} of the labels, and one that "
             f"sees it {accuracy:.0%}: the state says nearly everything about the label, so the predictor would hardly "
             "tell one action from another. Label what the action itself changed."
         )
@@ -76,7 +76,7 @@ def advise(report: PermissibilityReport) -> Iterator[str]:
         )
     if report.accuracy is not None and report.accuracy < SUFFICIENT_ACCURACY:
         yield (
-            f"A classifier foresees {report.accuracy:.0%} of the labels from (obs, action), below the gate of "
+            f"A classifier predicts {report.accuracy:.0%} of the labels from (obs, action), below the gate of "
             f"{SUFFICIENT_ACCURACY:.0%}: does the observation hold what the label depends on, velocities among it? Are "
             "its values of very different size (VecNormalize)?"
         )

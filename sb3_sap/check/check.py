@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_sap.check.advice import advise
-from sb3_sap.check.classifier import Foresight, foresee
+from sb3_sap.check.classifier import ClassifierResult, fit_classifier
 from sb3_sap.check.report import PermissibilityReport
 from sb3_sap.check.trials import label, rollout, try_actions
 from sb3_sap.common.arrays import stack_observations
@@ -59,7 +59,7 @@ def check_permissibility(
     transitions = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)
     labels = label(transitions, function)
     action_matters, label_changes = try_actions(env, function, seed)
-    foresight = foresee(
+    result = fit_classifier(
         env, stack_observations([t.obs for t in transitions]), np.stack([t.action for t in transitions]), labels, seed
     )
     findings: dict[str, Any] = {
@@ -68,7 +68,7 @@ def check_permissibility(
         "own_row": np.array_equal(label(transitions[::-1], function)[::-1], labels),
         "action_matters": action_matters,
         "label_changes": label_changes,
-        **(dict.fromkeys(Foresight._fields) if foresight is None else foresight._asdict()),
+        **(dict.fromkeys(ClassifierResult._fields) if result is None else result._asdict()),
         "policy_forbidden": None,
     }
     if act is not None:

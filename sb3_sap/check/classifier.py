@@ -33,7 +33,7 @@ class FlattenEntries(BaseFeaturesExtractor):
         return th.cat([entry.flatten(start_dim=1) for entry in observations.values()], dim=1)
 
 
-class Foresight(NamedTuple):
+class ClassifierResult(NamedTuple):
     """Balanced accuracies on examples that were never trained on."""
 
     #: Of a classifier that sees observation and action.
@@ -44,9 +44,9 @@ class Foresight(NamedTuple):
     action_informs: tuple[float, ...]
 
 
-def foresee(
+def fit_classifier(
     env: gym.Env[Any, Any], obs: Observations, actions: np.ndarray[Any, Any], labels: BoolArray, seed: int
-) -> Foresight | None:
+) -> ClassifierResult | None:
     """Fits E, as a guided model does, on a part of the examples and measures its accuracy on the others.
 
     :param obs: (n, *obs_shape), raw
@@ -75,7 +75,7 @@ def foresee(
         accuracy - float(np.mean([_accuracy(full, _shuffled(held_out, i, rng)) for _ in range(N_SHUFFLES)]))
         for i in range(actions.shape[1])
     )
-    return Foresight(accuracy, _accuracy(blind, _without_action(held_out)), informs)
+    return ClassifierResult(accuracy, _accuracy(blind, _without_action(held_out)), informs)
 
 
 def _classifier(env: gym.Env[Any, Any], seed: int, **optimizer_kwargs: Any) -> PermissibilityPredictor:

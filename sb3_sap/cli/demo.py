@@ -17,7 +17,8 @@ from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.cli.animation import animate
 from sb3_sap.cli.hub import EXTRAS
-from sb3_sap.cli.laps import add_simulator, drive_tracks, results_table
+from sb3_sap.cli.laps import drive_tracks, results_table
+from sb3_sap.cli.options import add_simulator
 from sb3_sap.cli.training_log import TrainingLog, ctrl_c_stops
 from sb3_sap.common.command_line import not_negative, positive
 from sb3_sap.common.files import atomic_path

@@ -8,9 +8,10 @@ from pathlib import Path
 from rich.console import Console
 
 from sb3_sap.benchmark.paper import TEST_TRACKS
-from sb3_sap.cli.laps import add_simulator, drive_tracks, results_table
+from sb3_sap.cli.laps import drive_tracks, results_table
+from sb3_sap.cli.options import add_path, add_simulator, add_vecnormalize
 from sb3_sap.evaluation.laps import write_results
-from sb3_sap.evaluation.normalisation import NormalisedPolicy, add_vecnormalize
+from sb3_sap.evaluation.normalisation import NormalisedPolicy
 from sb3_sap.evaluation.policies import load_policy
 
 
@@ -25,7 +26,7 @@ def add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     command.add_argument("model", type=Path, help="the .zip file of any SB3 model of the lane-keeping task")
     command.add_argument("--tracks", nargs="+", default=list(TEST_TRACKS), metavar="TRACK", help="tracks to drive")
-    command.add_argument("--json", type=Path, help="file of the results; by default evaluation.json beside the model")
+    add_path(command, "--json", help="file of the results (default: evaluation.json beside the model)")
     add_vecnormalize(command)
     add_simulator(command)
     command.set_defaults(run=_evaluate)

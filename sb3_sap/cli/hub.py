@@ -17,12 +17,13 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_sap import __version__
 from sb3_sap.cli.card import CARD, USE, USE_NORMALISED, env_arguments
+from sb3_sap.cli.options import add_vecnormalize
 from sb3_sap.common.command_line import positive
 from sb3_sap.common.errors import nearest
 from sb3_sap.common.files import atomic_path
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
-from sb3_sap.evaluation.normalisation import FILE_NAME, NormalisedPolicy, add_vecnormalize
+from sb3_sap.evaluation.normalisation import FILE_NAME, NormalisedPolicy
 from sb3_sap.evaluation.policies import load_policy
 
 #: Files of `sb3-sap demo`, besides the model, that are uploaded.

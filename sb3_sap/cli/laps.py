@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
 from rich.console import Console
@@ -11,12 +10,7 @@ from rich.table import Table
 
 from sb3_sap.benchmark.paper import TABLE_2, paper_score
 from sb3_sap.envs import TRACKS
-from sb3_sap.evaluation.laps import ENVIRONMENTS, LapResult, drive_lap
-
-
-def add_simulator(command: argparse.ArgumentParser) -> None:
-    """Adds ``--simulator`` to a command."""
-    command.add_argument("--simulator", choices=list(ENVIRONMENTS), default="highway", help="what the car drives on")
+from sb3_sap.evaluation.laps import LapResult, drive_lap
 
 
 def drive_tracks(policy: Any, tracks: list[str], simulator: str, console: Console) -> list[LapResult]:

@@ -5,7 +5,6 @@ A model file does not hold them, and a policy that learned on normalised observa
 
 from __future__ import annotations
 
-import argparse
 import pickle
 import re
 from pathlib import Path
@@ -106,13 +105,3 @@ def with_statistics(
     if learned_normalised is False and normalised.statistics.norm_obs:
         raise ValueError(f"{model} learned on raw observations: leave `--vecnormalize` out.")
     return normalised
-
-
-def add_vecnormalize(command: argparse.ArgumentParser) -> None:
-    """Adds ``--vecnormalize`` to a command that loads a policy."""
-    command.add_argument(
-        "--vecnormalize",
-        type=Path,
-        metavar="FILE",
-        help="statistics of SB3's VecNormalize; default: those beside the model, if there are any",
-    )

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_sap.common.arrays import FloatArray, Observations
-from sb3_sap.predictor.network import candidate_logits
+from sb3_sap.predictor.network import query_candidates
 
 #: Points along each axis of a picture.
 RESOLUTION = 121
@@ -34,7 +34,7 @@ def permissible_probability(model: Any, obs: Observations, actions: np.ndarray[A
     scaled = actions if isinstance(model.action_space, spaces.Discrete) else model.policy.scale_action(actions)
     if actions.ndim == len(shape) + 1:
         scaled = np.repeat(scaled[None], len(features), axis=0)
-    logits = candidate_logits(model.predictor, features, scaled.reshape(*scaled.shape[:2], -1))
+    logits = query_candidates(model.predictor, features, scaled.reshape(*scaled.shape[:2], -1))
     return np.asarray(1 / (1 + np.exp(-logits.astype(np.float64))))
 
 
@@ -142,12 +142,7 @@ def _normalised(model: Any, obs: Observations) -> Any:
 
 def _training_observations(model: Any) -> dict[str, np.ndarray[Any, Any]] | None:
     """The raw training observations of K, per key; None where there are none, as after ``load``."""
-    knowledge = model.knowledge
-    if len(knowledge) == 0:
-        return None
-    # `sample` would draw from the generator of the training.
-    slots = np.concatenate([knowledge.parts["train"].slots(label) for label in (0, 1)])
-    return {key: store[slots] for key, store in knowledge.observations.items()}
+    return model.knowledge.training_observations() if len(model.knowledge) else None
 
 
 def _typical_observation(model: Any) -> Any:

@@ -11,7 +11,7 @@ from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.common.vec_envs import environment_layout, policy_layout, unnormalized
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
 from sb3_sap.guidance.candidates import candidate_actions, choose
-from sb3_sap.predictor.network import candidate_logits
+from sb3_sap.predictor.network import query_candidates
 
 
 class GuidedPolicy:
@@ -69,7 +69,7 @@ def guided_prediction(
     candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
     permissible = model.allowed_candidates(raw, candidates)
     if model.predictor.fitted:
-        permissible &= candidate_logits(model.predictor, model.predictor.features(obs), candidates) > 0
+        permissible &= query_candidates(model.predictor, model.predictor.features(obs), candidates) > 0
     found = permissible.any(axis=1)
     if not found.any():
         return actions

@@ -17,7 +17,7 @@ from sb3_sap.guidance.candidates import SELECTIONS, choose
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.values import q_values
 from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
-from sb3_sap.predictor.network import candidate_logits
+from sb3_sap.predictor.network import query_candidates
 
 
 class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
@@ -35,7 +35,7 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
     """
 
     #: Whether the algorithm explores by itself (stochastic or ε-greedy), so that steps before t_k need no action noise.
-    stochastic_policy: ClassVar[bool] = False
+    explores_without_noise: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -90,13 +90,13 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
             return None
         obs, _ = self.policy.obs_to_tensor(cast(Any, self._last_obs))
         features = self.predictor.features(obs)
-        logits = candidate_logits(self.predictor, features[consulted], actions[consulted, None])[:, 0]  # line 6
+        logits = query_candidates(self.predictor, features[consulted], actions[consulted, None])[:, 0]  # line 6
         rejected = consulted[logits <= 0]  # line 7
         self.logger.record_mean("sap/rejection_rate", len(rejected) / len(consulted))
         if len(rejected) == 0:
             return None
         candidates, allowed = self.sample_candidates(rejected, n_envs)  # line 8
-        candidate_verdicts = candidate_logits(self.predictor, features[rejected], candidates)
+        candidate_verdicts = query_candidates(self.predictor, features[rejected], candidates)
         permissible = allowed & (candidate_verdicts > 0)  # line 9
         found = permissible.any(axis=1)  # line 10
         self.logger.record_mean("sap/fallback_rate", 1 - found.mean())
@@ -158,7 +158,7 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
                 f"`candidate_selection` must be one of {', '.join(map(repr, SELECTIONS))}, but is "
                 f"{self.candidate_selection!r}."
             )
-        if self.noise_steps > self.learning_starts and self.action_noise is None and not self.stochastic_policy:
+        if self.noise_steps > self.learning_starts and self.action_noise is None and not self.explores_without_noise:
             warnings.warn(
                 f"`t_k` = {self.t_k} is beyond `learning_starts` = {self.learning_starts}, but there is no "
                 "`action_noise`: between the two a deterministic policy does not explore.",

@@ -86,4 +86,4 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
                 self.predictor.batch_size,  # as many states as one gradient step of E
                 self._vec_normalize_env,
             )
-            self.logger.record_mean("sap/actor_loss", loss)
+            self.logger.record_mean("sap/auxiliary_loss", loss)

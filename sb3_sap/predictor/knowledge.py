@@ -143,22 +143,27 @@ class KnowledgeBuffer:
             self.actions[slot] = actions[i]
             self.seen[int(label)] += 1
 
+    def training_observations(self) -> dict[str, np.ndarray[Any, Any]]:
+        """The raw observations of the training part, (n, *obs_shape) for each key; an array's key is ``""``."""
+        slots = np.concatenate([self.parts["train"].slots(label) for label in CLASSES])
+        return {key: store[slots] for key, store in self.observations.items()}
+
     def typical_observation(self) -> Any:
         """The raw observation in K that lies nearest to the median of all; ``None`` if K is empty.
 
         The median itself may be an impossible state, for example of the sine and cosine of an angle.
         """
-        slots = np.concatenate([self.parts["train"].slots(label) for label in CLASSES])
-        if len(slots) == 0:
+        observed = self.training_observations()
+        n = len(next(iter(observed.values())))
+        if n == 0:
             return None
-        slots = slots[:: math.ceil(len(slots) / TYPICAL)]
-        distance = np.zeros(len(slots))
-        for store in self.observations.values():
-            rows = store[slots].reshape(len(slots), -1).astype(np.float64)
+        few = {key: rows[:: math.ceil(n / TYPICAL)] for key, rows in observed.items()}
+        distance = np.zeros(len(next(iter(few.values()))))
+        for observations in few.values():
+            rows = observations.reshape(len(observations), -1).astype(np.float64)
             spread = rows.std(axis=0)
             distance += (np.abs(rows - np.median(rows, axis=0)) / np.where(spread > 0, spread, 1)).sum(axis=1)
-        nearest = slots[distance.argmin()]
-        row = {key: store[nearest].copy() for key, store in self.observations.items()}
+        row = {key: rows[distance.argmin()].copy() for key, rows in few.items()}
         return row if self._keyed else row[""]
 
     def sample(

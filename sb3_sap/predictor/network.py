@@ -201,7 +201,7 @@ def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None
         raise ValueError(f"`learning_rate` of the predictor must be a number of at least 0, but is {learning_rate!r}.")
 
 
-def candidate_logits(
+def query_candidates(
     predictor: PermissibilityPredictor, features: th.Tensor, candidates: np.ndarray[Any, Any]
 ) -> FloatArray:
     """E's logits of n candidates in each of m states, in one call.

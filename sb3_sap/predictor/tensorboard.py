@@ -20,7 +20,7 @@ LAYOUT = {
             ["sap/alpha", "sap/consultation_rate", "sap/rejection_rate", "sap/fallback_rate"],
         ],
         "permissible actions": ["Multiline", ["sap/permissible_rate"]],
-        "losses": ["Multiline", ["sap/predictor_loss", "sap/actor_loss"]],
+        "losses": ["Multiline", ["sap/predictor_loss", "sap/auxiliary_loss"]],
     },
     "learning": {
         "return": ["Multiline", ["rollout/ep_rew_mean", "eval/mean_reward"]],

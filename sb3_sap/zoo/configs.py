@@ -17,6 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_sap.common.errors import nearest
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.schedules import LINEAR
+from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
 from sb3_sap.presets import RUNNER_KEYS, algorithms
 
 #: Types allowed by each word of a type annotation. The constructor checks what has other annotations.
@@ -30,7 +31,7 @@ KINDS: dict[str, tuple[type, ...]] = {
 #: Keys whose values are dotted names of classes or functions.
 DOTTED = ("env_wrapper", "vec_env_wrapper", "callback")
 #: Keys whose values may be "lin_0.001": rl_zoo3 converts the first of them, the constructors all.
-SCHEDULES = ("learning_rate", "actor_learning_rate", "actor_permissibility_coef")
+SCHEDULES = AuxiliaryLossMixin.schedules
 
 
 def packaged(algo: str) -> str | None:

@@ -107,7 +107,7 @@ class GuidedExperimentManager(ExperimentManager):
         """
         algorithm: Any = ALGOS[self.algo]
         without_noise = hyperparams.get("action_noise") is None and "learning_starts" not in hyperparams
-        deterministic = issubclass(algorithm, ActionPermissibilityMixin) and not algorithm.stochastic_policy
+        deterministic = issubclass(algorithm, ActionPermissibilityMixin) and not algorithm.explores_without_noise
         if "t_k" in hyperparams and without_noise and deterministic:
             return {**hyperparams, "learning_starts": hyperparams["t_k"]}
         return hyperparams

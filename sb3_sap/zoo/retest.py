@@ -16,7 +16,7 @@ from sb3_sap.common.files import atomic_path
 from sb3_sap.evaluation.statistics import bootstrap_difference, bootstrap_interval, interquartile_mean
 from sb3_sap.zoo import study_plots
 from sb3_sap.zoo.storages import check_belongs, load_study, without_password
-from sb3_sap.zoo.study_report import markdown_table, shown, target_name
+from sb3_sap.zoo.study_report import formatted, markdown_table, target_name
 from sb3_sap.zoo.tuning import StudyManager
 
 #: Name of the settings that change nothing.
@@ -113,8 +113,8 @@ def summary(rows: pd.DataFrame, study: optuna.Study, tracks: list[str], command:
     table = []
     for arm, matrix in scores.items():
         trial = trials.get(str(arm))
-        changed = ", ".join(f"{name} {shown(value)}" for name, value in trial.params.items()) if trial else ""
-        row = [arm, changed, shown(trial.value) if trial else "", len(matrix)]
+        changed = ", ".join(f"{name} {formatted(value)}" for name, value in trial.params.items()) if trial else ""
+        row = [arm, changed, formatted(trial.value) if trial else "", len(matrix)]
         row.append(f"{interquartile_mean(matrix):.4g}" + _interval(bootstrap_interval(matrix), ".4g", matrix))
         if arm == DEFAULT or DEFAULT not in scores:
             row.append("")

@@ -59,7 +59,7 @@ def markdown_table(header: list[str], rows: list[list[Any]]) -> list[str]:
     return ["| " + " | ".join(map(str, line)) + " |" for line in lines]
 
 
-def shown(value: Any) -> str:
+def formatted(value: Any) -> str:
     """A number with four digits; everything else as it is."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
@@ -79,7 +79,12 @@ def _markdown(study: optuna.Study, target: str, importance: dict[str, float], dr
     best = sorted(study_plots.completed(study), key=lambda trial: float(trial.value or 0), reverse=True)[:TOP]
     names = list(dict.fromkeys(name for trial in best for name in trial.params))
     rows = [
-        [t.number, shown(t.value), *(shown(t.params.get(name, "")) for name in names), t.user_attrs.get("seed", "")]
+        [
+            t.number,
+            formatted(t.value),
+            *(formatted(t.params.get(name, "")) for name in names),
+            t.user_attrs.get("seed", ""),
+        ]
         for t in best
     ]
     lines = [
@@ -93,6 +98,6 @@ def _markdown(study: optuna.Study, target: str, importance: dict[str, float], dr
         *markdown_table(["trial", "value", *names, "seed"], rows),
     ]
     if importance:
-        lines += ["", *markdown_table(["parameter", "importance"], [[k, shown(v)] for k, v in importance.items()])]
+        lines += ["", *markdown_table(["parameter", "importance"], [[k, formatted(v)] for k, v in importance.items()])]
     lines += [line for name in drawn for line in ("", f"![{Path(name).stem}]({name})")]
     return "\n".join(lines) + "\n"

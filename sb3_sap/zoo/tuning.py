@@ -157,7 +157,7 @@ class StudyManager(GuidedExperimentManager):
             else:
                 work_until(study, self.objective, self.max_total_trials)
         except KeyboardInterrupt:
-            print("Interrupted: the trials that are finished stay in the study.")
+            print("Interrupted: the finished trials remain in the study.")
         if not self.options.worker:
             self._report(study)
 

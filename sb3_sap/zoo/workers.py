@@ -91,8 +91,8 @@ def _refuse_failure(workers: list[subprocess.Popen[bytes]]) -> None:
     failed = [worker.returncode for worker in workers if worker.returncode]
     if failed:
         raise RuntimeError(
-            f"A worker of `--n-jobs` ended with exit status {failed[0]}, and the others were ended, too: mend what it "
-            "says above, and give the command again, on the same `--storage` to keep what is finished."
+            f"A worker of `--n-jobs` ended with exit status {failed[0]}, and the others were ended, too: correct what "
+            "it says above, and give the command again, on the same `--storage` to keep what is finished."
         )
 
 

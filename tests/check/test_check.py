@@ -162,7 +162,7 @@ def test_labels_that_the_action_does_not_decide():
     assert any("does the label depend on the action" in sentence for sentence in report.advice)
 
 
-def test_labels_that_cannot_be_foreseen_are_rough():
+def test_labels_that_cannot_be_predicted_are_rough():
     def parity(obs, actions, next_obs):
         return np.floor(actions[:, 0] * 100).astype(int) % 7 < 4
 

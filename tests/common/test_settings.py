@@ -79,7 +79,7 @@ def test_the_smallest_settings_that_can_work():
     build(DDPGAP, knowledge_buffer_size=16, min_per_class=7).learn(60)
 
 
-@pytest.mark.parametrize("algorithm", [algorithm for algorithm in GUIDED if not algorithm.stochastic_policy])
+@pytest.mark.parametrize("algorithm", [algorithm for algorithm in GUIDED if not algorithm.explores_without_noise])
 def test_t_k_beyond_the_warm_up_without_noise_warns(algorithm):
     with pytest.warns(
         UserWarning, match="^`t_k` = 11 is beyond `learning_starts` = 10, but there is no `action_noise`"

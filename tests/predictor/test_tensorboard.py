@@ -15,4 +15,4 @@ def test_tensorboard_gets_the_layout(tmp_path):
         assert all(chart.encode() in config for chart in charts)
     drawn = {tag for charts in LAYOUT.values() for _, tags in charts.values() for tag in tags}
     # Without actor loss and evaluation, every other curve is there.
-    assert drawn - set(events.Tags()["scalars"]) == {"sap/actor_loss", "eval/mean_reward"}
+    assert drawn - set(events.Tags()["scalars"]) == {"sap/auxiliary_loss", "eval/mean_reward"}

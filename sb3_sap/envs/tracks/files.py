@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 from pathlib import Path
 
+from sb3_sap.common.files import atomic_path
 from sb3_sap.envs.tracks.geometry import Segment, Track
 
 #: Columns of the table. ``type`` is TORCS': str, lft, rgt. A straight fills length_m, a curve the other columns.
@@ -46,7 +47,7 @@ def parse_table(lines: Iterable[str], name: str) -> Track:
 
 def write_table(track: Track, path: str | Path) -> None:
     """Write the table that `parse_table` reads back as the same track."""
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
+    with atomic_path(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         file.write(f"# width_m: {track.width!r}\n")
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)

@@ -1,6 +1,6 @@
 import os
 
-# Results are compared to the bit, which holds on one device: the CPU. `test_cuda.py` looks for a GPU by itself.
+# Results are compared to the bit, which requires one device: the CPU. `test_cuda.py` makes the GPU visible again.
 os.environ["SB3_SAP_TEST_GPUS"] = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
 os.environ["CUDA_VISIBLE_DEVICES"] = ""
 

@@ -31,7 +31,7 @@ STEPS = 200
 
 
 def versions():
-    """What is installed is what the bounds name; torch alone may be newer, for its old builds are large."""
+    """Installed versions are the lower bounds; only torch may be newer, because its old builds are large."""
     newer = []
     declared = {line.partition(";")[0] for line in metadata.requires("sb3-sap")}  # without the extras' markers
     for requirement in map(Requirement, sorted(declared)):
@@ -44,7 +44,7 @@ def versions():
 
 
 def algorithms():
-    """Each of them learns; a guided one fits its predictor, is saved, loaded and drawn."""
+    """Each algorithm learns; a guided one fits its predictor, and is saved, loaded and plotted."""
     for name, algorithm in ALGORITHMS.items():
         discrete = name in ("dqn_ap", "qrdqn_ap")
         env = gym.make("MountainCar-v0", max_episode_steps=50) if discrete else gym.make(LANE)
@@ -69,7 +69,7 @@ def algorithms():
 
 
 def commands():
-    """What each extra is for, as a user types it."""
+    """The commands that each extra is for, as a user types them."""
     lane = ["--algo", "ddpg_ap", "--env", LANE, "-n", str(STEPS)]
     grid = ["--simulator", "highway", "--steps", "100", "--seeds", "1", "--tracks", "g-track-3", "--out", "results"]
     study = ["--storage", "study.log", "--study-name", "lowest", "--max-total-trials", "2", "--n-evaluations", "1"]

@@ -1,3 +1,5 @@
+"""The whole state of a model, to compare one that was loaded with the one that was saved."""
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.utils import set_random_seed
@@ -24,7 +26,7 @@ def knowledge_state(model):
 
 
 def state(model):
-    """All that the next step depends on."""
+    """All that the next step depends on, by path."""
     found = {"parameters": model.get_parameters(), "steps": model.num_timesteps, "updates": model._n_updates}
     names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pos", "full")
     found["R"] = [getattr(model.replay_buffer, name) for name in names]
@@ -36,7 +38,7 @@ def state(model):
     return flat(found)
 
 
-def assert_same(one, other):
+def assert_same_state(one, other):
     a, b = state(one), state(other)
     assert a.keys() == b.keys()
     for name, value in a.items():
@@ -44,7 +46,7 @@ def assert_same(one, other):
 
 
 def reseed(model):
-    """What an interruption loses: the environment's episode, and the generators of SB3 and the environment."""
+    """Resets what a file does not hold: the episode, and the generators of SB3 and of the environment."""
     model._last_obs = None
     set_random_seed(7)
     model.env.seed(7)

@@ -1,3 +1,5 @@
+"""Models with a stub actor and a stub predictor, whose decisions can be computed in the head."""
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.logger import Logger
@@ -8,18 +10,18 @@ from sb3_sap import DDPGAP
 
 
 class StubPredictor:
-    """E with a rule (obs, actions) -> logits, that counts what it is asked."""
+    """A predictor with the given logits, a function of (obs, actions), which records its queries."""
 
-    def __init__(self, rule, fitted=True):
-        self.rule, self.fitted = rule, fitted
-        self.asked = []  # number of rows of each call
+    def __init__(self, logits_of, fitted=True):
+        self.logits_of, self.fitted = logits_of, fitted
+        self.queries = []  # number of rows of each
 
     def features(self, obs):
         return obs
 
     def logits(self, features, actions):
-        self.asked.append(len(actions))
-        return self.rule(features, actions)
+        self.queries.append(len(actions))
+        return self.logits_of(features, actions)
 
     def fit(self, dataset):
         return 0.0
@@ -29,6 +31,8 @@ class StubPredictor:
 
 
 class Constant(ActionNoise):
+    """Noise of one value, which counts its calls."""
+
     def __init__(self, value):
         self.value, self.calls = value, 0
 
@@ -38,21 +42,24 @@ class Constant(ActionNoise):
 
 
 def above(border):
+    """Logits that permit the actions above a border."""
     return lambda obs, actions: actions[:, 0] - border
 
 
 def never(obs, actions):
-    raise AssertionError("E must not be consulted here")
+    raise AssertionError("the predictor must not be queried here")
 
 
 def deny(obs, actions):
     return -th.ones(len(actions))
 
 
-def guided(actor, rule, *, alpha=1.0, obs=None, n_candidates=4, fitted=True, algorithm=DDPGAP, env=None, **settings):
-    """A model past t_k whose actor answers ``actor`` (env units) and whose E follows ``rule``."""
+def guided(
+    actor, logits_of, *, alpha=1.0, obs=None, n_candidates=4, fitted=True, algorithm=DDPGAP, env=None, **settings
+):
+    """A model past t_k whose actor always returns ``actor`` (env units) and whose predictor has the given logits."""
     model = build(algorithm, env, alpha=alpha, alpha_low=alpha, n_candidates=n_candidates, **settings)
-    model.predictor = StubPredictor(rule, fitted)
+    model.predictor = StubPredictor(logits_of, fitted)
     model.predict = lambda obs, deterministic: (np.array(actor, dtype=model.action_space.dtype), None)
     model.set_logger(Logger(None, []))
     model._last_obs = np.zeros((len(actor), 2), np.float32) if obs is None else np.array(obs, np.float32)
@@ -63,4 +70,5 @@ def guided(actor, rule, *, alpha=1.0, obs=None, n_candidates=4, fitted=True, alg
 
 
 def sample(model, noise=None):
+    """The actions that the model chooses for its last observations: in env units, and scaled."""
     return model._sample_action(model.learning_starts, noise, len(model._last_obs))

@@ -1,4 +1,4 @@
-"""Every algorithm through what users of SB3 combine it with."""
+"""Every algorithm with the features of SB3 that users combine it with."""
 
 import copy
 import inspect
@@ -20,18 +20,18 @@ from toy import ALGORITHMS, GUIDED, Line, build
 from sb3_sap import DDPGAP, CrossQAP, PermissibilityCallback
 from sb3_sap.common.settings import PAPER_STEPS
 
-# CrossQ has no policy but MlpPolicy.
+# CrossQ has only an MlpPolicy.
 every_algorithm_but_crossq = pytest.mark.parametrize("algorithm", [cls for cls in ALGORITHMS if cls is not CrossQAP])
 every_algorithm = pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda cls: cls.__name__)
 
 
 def trained(model):
-    """Whether the actor, and E where there is one, took gradient steps."""
+    """Whether the actor, and the predictor if there is one, took gradient steps."""
     return model._n_updates > 0 and (type(model) not in GUIDED or model.predictor.fitted)
 
 
 @every_algorithm
-def test_several_environments(algorithm):
+def test_algorithm_trains_in_several_environments(algorithm):
     env = DummyVecEnv([Line] * 3)
     model = build(algorithm, env, action_noise={"type": "normal", "sigma": 0.1}).learn(150)
     assert trained(model)
@@ -42,7 +42,7 @@ def test_several_environments(algorithm):
 
 @pytest.mark.slow
 @every_algorithm
-def test_environments_in_processes_of_their_own(algorithm):
+def test_algorithm_trains_in_subprocesses(algorithm):
     env = SubprocVecEnv([Line] * 2)
     try:
         assert trained(build(algorithm, env).learn(150))
@@ -51,7 +51,7 @@ def test_environments_in_processes_of_their_own(algorithm):
 
 
 @every_algorithm
-def test_vec_normalize(algorithm):
+def test_algorithm_trains_under_vec_normalize_and_stores_raw_observations(algorithm):
     model = build(algorithm, VecNormalize(DummyVecEnv([Line] * 2))).learn(150)
     assert trained(model)
     buffer = model.replay_buffer
@@ -60,13 +60,13 @@ def test_vec_normalize(algorithm):
 
 @pytest.mark.filterwarnings("ignore::tqdm.TqdmExperimentalWarning")
 @every_algorithm
-def test_progress_bar(algorithm, capsys):
+def test_progress_bar_reaches_the_last_step(algorithm, capsys):
     assert trained(build(algorithm).learn(150, progress_bar=True))
     assert "150/150" in capsys.readouterr().out
 
 
 @every_algorithm
-def test_tensorboard(algorithm, tmp_path):
+def test_tensorboard_log_has_the_metrics_of_the_algorithm(algorithm, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     build(algorithm, tensorboard_log=str(tmp_path)).learn(150)
@@ -79,7 +79,7 @@ def test_tensorboard(algorithm, tmp_path):
 
 
 @every_algorithm
-def test_eval_and_checkpoint_callbacks(algorithm, tmp_path):
+def test_eval_and_checkpoint_callbacks_work(algorithm, tmp_path):
     callbacks = [
         EvalCallback(Monitor(Line()), eval_freq=50, n_eval_episodes=2, log_path=str(tmp_path), verbose=0),
         CheckpointCallback(100, str(tmp_path), save_replay_buffer=True),
@@ -95,7 +95,7 @@ def test_eval_and_checkpoint_callbacks(algorithm, tmp_path):
 
 
 @every_algorithm
-def test_evaluate_policy(algorithm):
+def test_evaluate_policy_runs_whole_episodes(algorithm):
     model = build(algorithm).learn(30)
     env = Monitor(Line())
     env.reset(seed=3)
@@ -106,7 +106,7 @@ def test_evaluate_policy(algorithm):
 
 
 @every_algorithm
-def test_the_callers_dictionaries_are_left_alone(algorithm):
+def test_dictionaries_of_the_caller_are_used_and_not_modified(algorithm):
     given = {
         "policy_kwargs": {"net_arch": {"pi": [4], "qf": [6]}},
         "action_noise": {"type": "normal", "sigma": 0.1},
@@ -141,10 +141,10 @@ def rates(model):
         ({"learning_rate": lambda r: 0.02 * r, "actor_learning_rate": 0.002}, [0.002, 0.01]),
         ({"learning_rate": "lin_0.02", "actor_learning_rate": "lin_2e-3"}, [0.001, 0.01]),
     ],
-    ids=["number", "schedule", "two numbers", "actor schedule", "critic schedule", "as YAML writes them"],
+    ids=["number", "schedule", "two numbers", "actor schedule", "critic schedule", "as in YAML"],
 )
 @every_algorithm
-def test_learning_rates(algorithm, settings, expected, tmp_path):
+def test_learning_rates_of_actor_and_critic_follow_numbers_and_schedules(algorithm, settings, expected, tmp_path):
     class HalfWay(BaseCallback):
         seen = None
 
@@ -172,35 +172,35 @@ def test_learning_rates(algorithm, settings, expected, tmp_path):
     ],
 )
 @every_algorithm
-def test_noise_as_yaml_writes_it(algorithm, description, kind):
+def test_action_noise_can_be_given_as_in_yaml(algorithm, description, kind):
     model = build(algorithm, Line(dim=2), action_noise=description).learn(40)
     assert type(model.action_noise) is kind
     assert model.action_noise._sigma.tolist() == [description["sigma"]] * 2
 
 
 @every_algorithm
-def test_training_after_each_episode(algorithm):
+def test_training_after_each_episode_takes_the_given_gradient_steps(algorithm):
     model = build(algorithm, train_freq=(1, "episode"), gradient_steps=2).learn(150)
     assert trained(model)
     assert model._n_updates == 2 * 14  # 15 episodes, of which the first is the warm-up
 
 
 @every_algorithm
-def test_n_step_returns(algorithm):
+def test_algorithm_trains_with_n_step_returns(algorithm):
     model = build(algorithm, n_steps=3, gamma=0.5).learn(150)
     assert trained(model)
     assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.5)
 
 
 @every_algorithm_but_crossq
-def test_dict_observations(algorithm):
+def test_algorithm_trains_on_dict_observations(algorithm):
     model = build(algorithm, Line("dict"), policy="MultiInputPolicy").learn(150)
     assert trained(model)
     assert isinstance(model.replay_buffer, DictReplayBuffer)
 
 
 @every_algorithm_but_crossq
-def test_hindsight(algorithm, tmp_path):
+def test_algorithm_trains_with_hindsight_and_continues_after_loading(algorithm, tmp_path):
     settings = {"policy": "MultiInputPolicy", "replay_buffer_class": HerReplayBuffer, "learning_starts": 20}
     model = build(algorithm, Line("goal"), replay_buffer_kwargs={"n_sampled_goal": 2}, **settings).learn(150)
     assert trained(model)
@@ -213,7 +213,7 @@ def test_hindsight(algorithm, tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", [algorithm for algorithm in GUIDED if algorithm is not CrossQAP])
-def test_images(algorithm):
+def test_algorithm_trains_on_images_and_stores_them_as_uint8(algorithm):
     class Picture(Line):
         def __init__(self):
             super().__init__()
@@ -228,7 +228,7 @@ def test_images(algorithm):
 
 
 @every_algorithm
-def test_the_signature_shows_what_can_be_passed(algorithm):
+def test_signature_lists_the_parameters(algorithm):
     parameters = inspect.signature(algorithm).parameters
     expected = {"policy", "env", "learning_rate", "buffer_size", "seed", "device", "actor_learning_rate"}
     expected |= {"alpha", "t_k", "ap_function", "predictor_kwargs"} if algorithm in GUIDED else set()
@@ -239,13 +239,13 @@ def test_the_signature_shows_what_can_be_passed(algorithm):
 
 
 @every_algorithm
-def test_learn_runs_the_papers_steps_by_default(algorithm):
+def test_learn_defaults_to_the_steps_of_the_paper(algorithm):
     assert PAPER_STEPS == 15_000
     assert inspect.signature(algorithm.learn).parameters["total_timesteps"].default == PAPER_STEPS
 
 
-def test_the_line_of_the_readme_as_typed(monkeypatch):
-    # All 15,000 steps take minutes: the callback that the model installs by itself ends the run after 200.
+def test_learn_without_arguments_schedules_the_steps_of_the_paper(monkeypatch):
+    # All 15,000 steps take minutes: the callback that the model installs ends the run after 200.
     monkeypatch.setattr(PermissibilityCallback, "_on_step", lambda self: self.num_timesteps < 200)
     env = Line()
     model = DDPGAP("MlpPolicy", env).learn()

@@ -1,4 +1,4 @@
-"""What docs/can_i_use_it.md promises, tried with every algorithm."""
+"""The features that docs/can_i_use_it.md lists, tried with every algorithm."""
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +30,7 @@ def line(algorithm, **kwargs):
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", EVERY)
 @pytest.mark.parametrize("what", ["two environments", "VecNormalize", "n-step", "dict", "her", "images"])
-def test_what_is_promised(algorithm, what):
+def test_documented_feature_can_be_used(algorithm, what):
     def make():
         return line(algorithm, kind={"dict": "dict", "her": "goal"}.get(what, "array"))
 
@@ -58,5 +58,5 @@ def test_what_is_promised(algorithm, what):
         assert not hasattr(model, "predictor") or model.predictor.fitted
 
 
-def test_the_picture_shows_x():
+def test_pictures_reach_the_policy_channels_first():
     assert build(DDPGAP, Picture(Line()), policy="CnnPolicy").observation_space.shape == (1, 36, 36)

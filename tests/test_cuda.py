@@ -32,7 +32,7 @@ TRAIN = """if True:
 
 @pytest.mark.parametrize("algo", ["ddpg_ap", "td3_ap", "sac_ap", "tqc_ap", "crossq_ap", "dqn_ap", "qrdqn_ap"])
 @pytest.mark.parametrize("optimizer", ["Adam", "Adagrad"])
-def test_it_trains_on_a_gpu_and_loads_on_the_cpu(algo, optimizer, tmp_path):
+def test_algorithm_trains_on_a_gpu_and_loads_on_the_cpu(algo, optimizer, tmp_path):
     visible = os.environ["SB3_SAP_TEST_GPUS"]
     env = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}
     env |= {} if visible == "all" else {"CUDA_VISIBLE_DEVICES": visible}

@@ -1,4 +1,4 @@
-"""What README and docs say must be so."""
+"""README and docs agree with the package: links, tables, snippets, commands and names."""
 
 import inspect
 import json
@@ -61,7 +61,7 @@ def anchors(page):
 @pytest.mark.parametrize(
     ("page", "target", "anchor"), LINKS, ids=[f"{name_of(page)}-{target}#{anchor}" for page, target, anchor in LINKS]
 )
-def test_links_lead_somewhere(page, target, anchor):
+def test_links_have_targets(page, target, anchor):
     path = page.parent / target if target else page
     assert path.exists()
     assert not anchor or anchor in anchors(path)
@@ -73,7 +73,7 @@ def test_tables_and_code_are_those_of_their_sources(page):
     assert TEXTS[name_of(page)] == filled(page)
 
 
-def test_a_row_that_a_table_does_not_have_is_named(tmp_path):
+def test_row_that_a_table_does_not_have_is_named(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("<!-- table: torcs-3000/headline.md rows: linear ddpg -->\n<!-- end -->\n", encoding="utf-8")
     with pytest.raises(ValueError, match="no row 'ddpg'"):
@@ -86,11 +86,11 @@ TAGLINE = "A Stable-Baselines3 extension that learns which actions are permissib
 
 
 @pytest.mark.parametrize("name", ["README.md", "setup.cfg", "CITATION.cff", "sb3_sap/__init__.py"])
-def test_the_tagline_is_the_same_everywhere(name):
+def test_tagline_is_the_same_everywhere(name):
     assert TAGLINE in (ROOT / name).read_text(encoding="utf-8")
 
 
-def test_the_site_begins_with_the_first_screen_of_the_readme():
+def test_site_begins_with_the_first_screen_of_the_readme():
     options = dict(re.findall(r'^:(start-after|end-before): "(.+)"$', TEXTS["index.md"], re.MULTILINE))
     after, before = options["start-after"], options["end-before"]
     assert [TEXTS["README.md"].count(text) for text in (after, before)] == [1, 1]
@@ -99,7 +99,7 @@ def test_the_site_begins_with_the_first_screen_of_the_readme():
     assert "def ap_function" in screen
 
 
-def test_the_ap_function_of_the_first_screen_is_that_of_lane_keeping():
+def test_ap_function_of_the_first_screen_is_that_of_lane_keeping():
     names = {"np": np}
     exec(SNIPPETS["README.md"][0], names)
     obs, next_obs = np.random.default_rng(0).uniform(-1, 1, (2, 100, 5))
@@ -114,7 +114,7 @@ def test_the_ap_function_of_the_first_screen_is_that_of_lane_keeping():
 SNIPPETS = {
     name: re.findall(r"^ *```python\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE) for name, text in TEXTS.items()
 }
-#: The scripts of the README; the other example has tests of its own.
+#: The scripts of the README; the other example has its own tests.
 EXAMPLES = sorted(path for path in (ROOT / "examples").glob("*.py") if path.stem != "ddpg_ap_minimal")
 
 
@@ -141,14 +141,14 @@ def test_examples_run(example, tmp_path, monkeypatch):
     assert run_shortly(example.read_text(encoding="utf-8"), example.name, {}, steps=120) == 1
 
 
-def test_the_readme_shows_every_example():
+def test_readme_shows_every_example():
     assert len(EXAMPLES) >= 2
     assert SNIPPETS["README.md"][1:] == [path.read_text(encoding="utf-8") for path in EXAMPLES]
     assert "](examples/ddpg_ap_minimal.py)" in TEXTS["README.md"]
 
 
 @pytest.mark.slow
-def test_the_readmes_own_problem_is_solved_as_it_says():
+def test_problem_of_the_readme_is_solved_as_it_says():
     names = runpy.run_path(str(ROOT / "examples" / "your_own_problem.py"))
     assert names["model"].num_timesteps == 1_000
     assert evaluate_policy(names["model"], Monitor(names["env"]), n_eval_episodes=5)[0] > 80
@@ -156,7 +156,7 @@ def test_the_readmes_own_problem_is_solved_as_it_says():
 
 # ---------------------------------------------------------------- commands
 
-#: What a command line of this package begins with, on a page; comments and other programs are left out.
+#: The command lines of this package on each page, without comments.
 COMMANDS = [
     (name, line.split("  #")[0].strip())
     for name, text in TEXTS.items()
@@ -165,13 +165,13 @@ COMMANDS = [
     for line in block.replace("\\\n", "").splitlines()
     if line.strip().startswith("sb3-sap ")
 ]
-#: Of other tests, or over the network, or of hours.
+#: Commands that other tests run, or that need the network or hours.
 LONG = ("benchmark", "train", "enjoy", "optimize", "retest", "record-video", "plot", "torcs")
 
 
 @pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}-{command}" for page, command in COMMANDS])
-def test_commands_are_understood(page, command):
-    """Every flag of every printed command exists; RL Zoo's, which it reads itself, are run by test_zoo."""
+def test_printed_commands_are_accepted(page, command):
+    """Every flag of every printed command exists; tests/zoo runs those of RL Zoo, which reads them itself."""
     arguments = shlex.split(command)[1:]
     if arguments[0] in zoo.COMMANDS:
         return
@@ -179,12 +179,12 @@ def test_commands_are_understood(page, command):
         with pytest.raises(SystemExit, match="0"):
             parser().parse_args(arguments)
     else:
-        parser().parse_args(arguments)  # exits with 2 where it does not understand
+        parser().parse_args(arguments)  # exits with 2 if it refuses them
 
 
 @pytest.mark.slow
 def test_commands_run_as_printed(tmp_path, monkeypatch):
-    """Those that need no network and no hours, in the order in which the pages print them."""
+    """Commands that need neither the network nor hours, in the order of the pages."""
     monkeypatch.chdir(tmp_path)
     env = gym.make("sap/LaneKeeping-v0", laps=None)
     DDPGAP("MlpPolicy", env, seed=1).learn(300).save("wheel2")
@@ -210,22 +210,22 @@ def test_every_public_name_is_in_the_reference():
     assert {cls.__name__ for cls in ALGORITHMS.values()} <= set(named)
 
 
-def test_every_parameter_is_told():
-    told = set(re.findall(r"`(\w+)`", TEXTS["parameters.md"]))
+def test_every_parameter_is_documented():
+    documented = set(re.findall(r"`(\w+)`", TEXTS["parameters.md"]))
     own = {name for cls in (DDPGAP, sb3_sap.DDPGAPCE2) for name in inspect.signature(cls).parameters}
     predictor = set(inspect.signature(sb3_sap.PermissibilityPredictor).parameters)
-    assert own - set(inspect.signature(DDPG).parameters) <= told
-    assert predictor - {"observation_space", "action_space"} <= told
+    assert own - set(inspect.signature(DDPG).parameters) <= documented
+    assert predictor - {"observation_space", "action_space"} <= documented
 
 
-def test_the_defaults_told_are_those_of_the_constructor():
+def test_documented_defaults_are_those_of_the_constructor():
     rows = re.findall(r"^\| `(\w+)` \| `?\"?([\d.,]+|random)\"?`? \|", TEXTS["parameters.md"], re.MULTILINE)
     assert len(rows) >= 14
-    told = {name: text if text == "random" else float(text.replace(",", "")) for name, text in rows}
-    # E's rate and batch size have the names of the algorithm's.
+    documented = {name: text if text == "random" else float(text.replace(",", "")) for name, text in rows}
+    # The predictor's learning rate and batch size have the names of the algorithm's.
     constructors = (DDPGAP, sb3_sap.PermissibilityPredictor)
     defaults = {name: p.default for cls in constructors for name, p in inspect.signature(cls).parameters.items()}
-    assert told == {name: defaults[name] for name in told}
+    assert documented == {name: defaults[name] for name in documented}
 
 
 def test_every_logged_metric_is_defined():
@@ -235,11 +235,11 @@ def test_every_logged_metric_is_defined():
     assert logged <= set(re.findall(r"`((?:sap|train)/\w+)`", TEXTS["method.md"]))
 
 
-def test_every_algorithm_has_its_row():
+def test_every_algorithm_has_its_row_in_can_i_use_it():
     assert {cls.__name__ for cls in ALGORITHMS.values()} <= set(re.findall(r"`(\w+)`", TEXTS["can_i_use_it.md"]))
 
 
-def test_the_chain_of_mixins_is_that_of_the_class():
+def test_documented_chain_of_mixins_is_that_of_the_class():
     [chain] = re.findall(r"```text\n(DDPGAP .*?)```", TEXTS["developer.md"], re.DOTALL)
     drawn = [line.split()[0] for line in chain.splitlines()]
     assert drawn == [cls.__name__ for cls in DDPGAP.__mro__ if cls.__module__ not in ("abc", "builtins")]
@@ -257,7 +257,7 @@ SPACES = {
 
 
 class Anything(gym.Env):
-    """Observations and actions of any space, without a meaning."""
+    """An environment with any spaces."""
 
     def __init__(self, observation_space, action_space):
         self.observation_space, self.action_space = observation_space, action_space
@@ -271,7 +271,7 @@ class Anything(gym.Env):
 
 
 def learns(cls, observation_space, action_space):
-    """Whether an algorithm takes these spaces."""
+    """Whether an algorithm accepts these spaces."""
     policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
     settings = {"constraint": nearby} if cls in CONSTRAINED else {}
     try:
@@ -282,7 +282,7 @@ def learns(cls, observation_space, action_space):
 
 
 @pytest.mark.parametrize("page", FAMILIES, ids=lambda page: page.stem)
-def test_a_page_of_a_family_tells_which_spaces_it_takes(page):
+def test_family_page_lists_the_spaces_that_its_algorithms_take(page):
     text = TEXTS[name_of(page)]
     rows = re.findall(r"^\| `(\w+)` \| ([✓✗]) \| ([✓✗]) \|$", text, re.MULTILINE)
     assert [name for name, _, _ in rows] == list(SPACES)
@@ -293,7 +293,7 @@ def test_a_page_of_a_family_tells_which_spaces_it_takes(page):
 
 
 @pytest.mark.parametrize("page", FAMILIES, ids=lambda page: page.stem)
-def test_a_page_of_a_family_has_the_sections_of_sb3s(page):
+def test_family_page_has_the_sections_of_the_pages_of_sb3(page):
     sections = re.findall(r"^## (.+)$", TEXTS[name_of(page)], re.MULTILINE)
     assert sections == ["Notes", "Can I use?", "Example", "Results", "Parameters"]
     assert f"algorithms/{page.stem}\n" in TEXTS["index.md"]
@@ -306,7 +306,7 @@ def test_every_algorithm_is_on_one_page():
 
 # ---------------------------------------------------------------- notebooks
 
-#: The constants at the top of each notebook, cut to what shows that its cells run; 01 runs as it is.
+#: Constants at the top of each notebook, reduced so that its cells run shortly; 01 runs unchanged.
 NOTEBOOKS = {
     "01_action_permissibility": {},
     "02_lane_keeping": {"STEPS": 800, "TEST_TRACKS": ["g-track-3"]},

@@ -1,4 +1,4 @@
-"""What CONTRIBUTING.md says an extension takes: each is made in a temporary copy of the repository, and used."""
+"""The extensions of CONTRIBUTING.md: each is made in a temporary copy of the repository, and used."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ def copy(tmp_path):
 
 
 def edit(path, old, new):
-    """Replaces the one place where a text stands."""
+    """Replaces a text that occurs once."""
     text = path.read_text(encoding="utf-8")
     assert text.count(old) == 1, f"{path.name} has {text.count(old)} times {old!r}"
     path.write_text(text.replace(old, new), encoding="utf-8")
@@ -37,7 +37,7 @@ def use(copy, program):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_a_further_base_algorithm_takes_three_edits(copy):
+def test_further_base_algorithm_takes_three_edits(copy):
     edit(
         copy / "sb3_sap" / "algorithms.py",
         "#: Every algorithm by its RL Zoo name.",
@@ -61,7 +61,7 @@ def test_a_further_base_algorithm_takes_three_edits(copy):
     assert list((copy / "logs" / "other_ap").glob("*/*.zip"))
 
 
-def test_a_further_task_takes_two_edits(copy):
+def test_further_task_takes_two_edits(copy):
     (copy / "sb3_sap" / "tasks" / "cart_pole.py").write_text(
         "def rises(obs, actions, next_obs):\n    return abs(next_obs[:, 2]) <= abs(obs[:, 2])\n", "utf-8"
     )
@@ -82,7 +82,7 @@ def test_a_further_task_takes_two_edits(copy):
     assert list((copy / "logs" / "dqn_ap").glob("*/*.zip"))
 
 
-def test_a_further_benchmark_configuration_takes_one_edit(copy):
+def test_further_benchmark_configuration_takes_one_edit(copy):
     configurations = ["linear", "ddpg_ap:default[alpha=0.25]"]
     edit(
         copy / CONFIGURATIONS,

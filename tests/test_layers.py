@@ -12,7 +12,7 @@ import sb3_sap
 
 PACKAGE = Path(sb3_sap.__file__).parent
 # From the top. A package or module may import its own modules, its own layer's where they form no circle, and those
-# below; the environments and their tasks are a tower of their own, which only the upper layers know.
+# below; the environments and their tasks are separate layers, which only the upper layers know.
 LAYERS = (
     {"cli"},
     {"zoo", "benchmark"},
@@ -24,9 +24,9 @@ LAYERS = (
     {"permissibility"},
     {"common"},
 )
-TOWER = ({"tasks"}, {"envs"})
+ENVIRONMENT_LAYERS = ({"tasks"}, {"envs"})
 MAY_KNOW_ENVIRONMENTS = {"cli", "zoo", "benchmark", "evaluation", "plots"}
-# What of the lower layers environments and tasks may use: what knows NumPy and the standard library alone.
+# The modules of lower layers that environments and tasks may import: those of NumPy and the standard library alone.
 ENVIRONMENTS_MAY_IMPORT = {
     "sb3_sap.common.arrays",
     "sb3_sap.common.errors",
@@ -50,7 +50,7 @@ MODULES = modules()
 
 
 def imports(path):
-    """The dotted names that a file imports, lazily too, those for type checkers left out."""
+    """The dotted names that a file imports, also inside functions, but not those for type checkers only."""
     found = []
 
     def visit(node):
@@ -83,7 +83,7 @@ def layer(name):
 
 
 def test_every_module_is_in_exactly_one_layer():
-    everything = [name for names in (*LAYERS, *TOWER) for name in names]
+    everything = [name for names in (*LAYERS, *ENVIRONMENT_LAYERS) for name in names]
     assert len(everything) == len(set(everything))
     assert {top(name) for name in MODULES} == set(everything)
 
@@ -117,7 +117,7 @@ def test_tasks_need_numpy_alone():
     assert foreign - sys.stdlib_module_names == {"numpy", "sb3_sap"}
 
 
-def test_the_ap_function_needs_numpy_and_gymnasium_alone():
+def test_permissibility_needs_numpy_and_gymnasium_alone():
     below = {"sb3_sap.common.arrays", "sb3_sap.common.reward_shaping"}
     assert used("sb3_sap.permissibility") == below
     for name in ("sb3_sap.permissibility", *below):
@@ -125,7 +125,7 @@ def test_the_ap_function_needs_numpy_and_gymnasium_alone():
         assert foreign <= {"gymnasium", "numpy", "sb3_sap"}
 
 
-def test_imports_are_read_as_they_are_written():
+def test_imports_are_found_as_they_are_written():
     assert "sb3_sap.guidance.mixin.ActionPermissibilityMixin" in imports(MODULES["sb3_sap.algorithms"])
     assert used("sb3_sap.algorithms") == {
         "sb3_sap.guidance.constrained",
@@ -133,10 +133,10 @@ def test_imports_are_read_as_they_are_written():
         "sb3_sap.guidance.mixin",
         "sb3_sap.predictor.mixin",
     }
-    assert "sb3_sap.envs.viewer" in used("sb3_sap.envs.lane_keeping")  # though only when something is drawn
+    assert "sb3_sap.envs.viewer" in used("sb3_sap.envs.lane_keeping")  # although only when something is drawn
 
 
-def test_importing_the_package_brings_no_simulator_and_no_plotting():
+def test_importing_the_package_loads_no_simulator_and_no_plotting():
     code = """if True:
         import sys
         import stable_baselines3
@@ -149,7 +149,7 @@ def test_importing_the_package_brings_no_simulator_and_no_plotting():
     heavy = ("pygame", "highway_env", "matplotlib", "pandas", "scipy", "PIL", "rl_zoo3", "optuna", "rich", "moviepy")
     assert "sb3_sap.algorithms" in new
     assert [name for name in new if name.split(".")[0] in heavy] == []
-    # Of the package itself, what trains comes along, and neither commands nor the benchmark.
+    # Of the package itself, it loads what training needs, and neither commands nor the benchmark.
     assert {"cli", "zoo", "benchmark", "evaluation", "plots"} & {
         top(n) for n in new if n.startswith("sb3_sap.")
     } == set()

@@ -1,4 +1,4 @@
-"""`examples/ddpg_ap_minimal.py` decides as the package does: same weights, same K, same candidates, same draws."""
+"""`examples/ddpg_ap_minimal.py` takes the package's decisions, given the same weights, K, candidates and draws."""
 
 import ast
 import importlib.util
@@ -33,7 +33,7 @@ minimal = load()
 
 
 def pair(**settings):
-    """E of the package and of the example, with the same weights."""
+    """The predictors of the package and of the example, with the same weights."""
     e = PermissibilityPredictor(OBS, ACTIONS, **settings)
     own = minimal.network(3)
     own.load_state_dict(e.head.state_dict())
@@ -46,7 +46,7 @@ def examples(n, seed=0):
     return LabelledActions(*(np.float32(x) for x in (obs, actions, (actions[:, 0] > obs[:, 0]))))
 
 
-def test_it_does_not_import_the_package():
+def test_example_does_not_import_the_package():
     tree = ast.parse(FILE.read_text(encoding="utf-8"))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
@@ -54,7 +54,7 @@ def test_it_does_not_import_the_package():
 
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.98])
-def test_k_holds_the_same_examples(share):
+def test_knowledge_buffers_hold_the_same_tuples(share):
     k = KnowledgeBuffer(OBS, 1, size=100, validation_fraction=0.2, seed=3, min_per_class=8)
     own = {"train": minimal.Knowledge(80, 8), "validation": minimal.Knowledge(20, 8)}
     split = np.random.default_rng()
@@ -70,7 +70,7 @@ def test_k_holds_the_same_examples(share):
             assert held == Counter((*obs.tolist(), *action.tolist()) for obs, action in mine.classes[label])
 
 
-def test_its_sample_is_balanced_and_comes_from_k():
+def test_sample_of_the_example_is_balanced_and_comes_from_k():
     k = minimal.Knowledge(50, 5)
     data = examples(40)
     for obs, action, label in zip(*data, strict=True):
@@ -81,7 +81,7 @@ def test_its_sample_is_balanced_and_comes_from_k():
     assert 0 < labels[:10].sum() < 10  # in random order
 
 
-def test_one_fit_moves_the_weights_alike():
+def test_fits_change_the_weights_alike():
     e, own = pair(optimizer_class="SGD", learning_rate=0.01, weight_decay=0.01, batch_size=128)
     optimizer = th.optim.SGD(own.parameters(), 0.01, weight_decay=0.01)
     for seed in range(3):
@@ -96,20 +96,20 @@ def test_one_fit_moves_the_weights_alike():
     )
 
 
-def test_candidates_are_the_same_draws():
+def test_candidates_are_the_same():
     ones = np.ones((1, 1))
     theirs = stratified_candidates(np.random.default_rng(5), -ones, ones, 128)[0]
     np.testing.assert_allclose(minimal.sample_candidates(np.random.default_rng(5), 128), theirs, atol=1e-6)
 
 
-def test_algorithm_1_decides_alike():
+def test_algorithm_1_takes_the_same_decisions():
     model = build(DDPGAP, predictor_kwargs={"net_arch": [128, 256]}, alpha=0.7)
     model.learn(5)
     model.predictor.n_updates += 1
     model.validation_accuracy = 1.0
     own = minimal.network(3)
     own.load_state_dict(model.predictor.head.state_dict())
-    with th.no_grad():  # verdicts of both kinds, and states in which nothing is permissible
+    with th.no_grad():  # permissible and rejected actions, and states in which no candidate is permissible
         for head in (own, model.predictor.head):
             head[-1].bias -= 0.06
     outcomes = Counter()
@@ -130,7 +130,7 @@ def test_algorithm_1_decides_alike():
 
 
 @pytest.mark.slow
-def test_it_learns_to_keep_the_lane():
+def test_example_learns_to_keep_the_lane():
     def env(**options):
         return gym.make("sb3_sap:sap/LaneKeeping-v0", **options)
 

@@ -1,4 +1,4 @@
-"""Mistakes that users make, and the sentence that each of them gets: one row for each, in one table."""
+"""Mistakes that users make, one row each, with the sentence that each of them gets."""
 
 import contextlib
 import io
@@ -38,9 +38,9 @@ from sb3_sap.envs.tracks import get_track
 from sb3_sap.evaluation.policies import load_policy
 
 LANE, TORCS = "sap/LaneKeeping-v0", "sap/TorcsLaneKeeping-v0"
-#: Characters that a sentence may have, and words that tell what to do or what was expected.
+#: The maximum length of a sentence, and words that say what to do or what was expected.
 LONGEST = 400
-TELLS = re.compile(
+HELPFUL = re.compile(
     r"\b(add|are required|build|but|call|called with|choose|did you mean|expected|form|give|invalid|known are|leave|"
     r"load|maybe meant|must|name|needs?|no setting|not a|not match|not of|or no such|pass|room for|save|such as|takes?|"
     r"unexpected|unrecognized|use|was|wasn't|wrap|write|writes)\b"
@@ -81,7 +81,7 @@ def with_spaces(action=None, observation=None, **settings):
     return env
 
 
-class Says(Line):
+class Labels(Line):
     """Puts a value of any type into ``info["permissible"]``."""
 
     def __init__(self, value):
@@ -93,7 +93,7 @@ class Says(Line):
 
 
 class OldStep(Line):
-    """As Gym had it."""
+    """The interface of Gym, before Gymnasium."""
 
     def step(self, action):
         obs, reward, _, truncated, info = super().step(action)
@@ -309,9 +309,9 @@ FUNCTIONS = [
         "ap_function", training(ap_function=lambda obs, action: True), RuntimeError, r"with batches \(obs, actions, nex"
     ),
     Row("ap_function", training(env=Line(labels=False)), ValueError, "^There is no AP function: .*Pass `ap_function="),
-    Row('info["permissible"]', training(env=Says(None)), TypeError, r"must be a bool, but is None\.$"),
-    Row('info["permissible"]', training(env=Says(1)), TypeError, r"must be a bool, but is 1\.$"),
-    Row('info["permissible"]', training(env=Says(np.array([True]))), TypeError, r"but is array\(\[ True\]\)\.$"),
+    Row('info["permissible"]', training(env=Labels(None)), TypeError, r"must be a bool, but is None\.$"),
+    Row('info["permissible"]', training(env=Labels(1)), TypeError, r"must be a bool, but is 1\.$"),
+    Row('info["permissible"]', training(env=Labels(np.array([True]))), TypeError, r"but is array\(\[ True\]\)\.$"),
     Row("permissible", given(ActionPermissibility, Line(), True), TypeError, "but is True: pass the function itself"),
     Row("permissible_actions", having(permissible_actions=3), TypeError, "must be a function or its dotted name"),
     Row("permissible_actions", training(permissible_actions=fails), RuntimeError, r"batches \(obs, actions\) of n = 1"),
@@ -576,7 +576,7 @@ ZOO = [
 
 
 def sentence_of(mistake):
-    """What is raised, or what a command writes to the standard error."""
+    """The message of the exception, or what a command writes to the standard error."""
     if isinstance(mistake.error, type):
         with pytest.raises(mistake.error) as raised:
             mistake.make()
@@ -586,7 +586,7 @@ def sentence_of(mistake):
     with contextlib.redirect_stderr(error), contextlib.redirect_stdout(io.StringIO()):
         try:
             code = mistake.make()
-        except SystemExit as end:  # argparse, below the usage
+        except SystemExit as end:  # by argparse, which prints the usage first
             code = end.code
     assert code == mistake.error
     text = error.getvalue().rstrip("\n")
@@ -599,7 +599,7 @@ def check(mistake):
     assert len(sentence) <= LONGEST
     assert "\n" not in sentence
     assert mistake.about in sentence
-    assert TELLS.search(sentence), sentence
+    assert HELPFUL.search(sentence), sentence
 
 
 def names(mistakes):
@@ -611,11 +611,11 @@ PYTHON = [*CONSTRUCTORS, *SPACES, *FUNCTIONS, *CHECKS, *FILES, *ENVIRONMENTS, *C
 
 @pytest.mark.filterwarnings("ignore:`.*cannot be pickled", "ignore:`t_k`")
 @pytest.mark.parametrize("mistake", PYTHON, ids=names(PYTHON))
-def test_a_mistake_gets_a_sentence(mistake):
+def test_mistake_gets_one_sentence(mistake):
     check(mistake)
 
 
 @pytest.mark.parametrize("mistake", ZOO, ids=names(ZOO))
-def test_a_mistake_in_rl_zoos_commands_gets_a_sentence(mistake):
+def test_mistake_in_commands_of_rl_zoo_gets_one_sentence(mistake):
     pytest.importorskip("rl_zoo3", reason="RL Zoo is not installed: pip install sb3-sap[zoo]")
     check(mistake)

@@ -1,7 +1,4 @@
-"""What is published: the wheel that is built from the sdist works with what it declares, and with nothing else.
-
-And how it is published: a release changes the version alone, or nothing.
-"""
+"""The wheel that is built from the sdist works with its declared requirements alone; a release changes the version."""
 
 import configparser
 import os
@@ -49,7 +46,7 @@ PROGRAMS = {
     "postgres": "import psycopg, sb3_sap.zoo.storages, sb3_sap.zoo.tuning",
     "zoo": 'main(["train", "--algo", "ddpg_ap", "--env", "sap/LaneKeeping-v0", "-n", "50", "-f", "logs"])',
 }
-#: What each of them begins with: what is not declared cannot be found, as if it were not installed.
+#: The beginning of each program: what is not declared cannot be imported, as if it were not installed.
 ALONE = """
     import sys
 
@@ -91,7 +88,7 @@ def normal(name):
 
 
 def brought_by(distribution, extra):
-    """The names of all that is installed with a distribution and one of its extras."""
+    """The names of all distributions that are installed with one of them and one of its extras."""
     found, wanted = set(), [(distribution, extra)]
     while wanted:
         distribution, extra = wanted.pop()
@@ -122,7 +119,7 @@ def test_every_requirement_has_a_lower_bound():
     assert [str(one) for one in declared() if lower_bound(one) is None] == []
 
 
-def test_torch_is_no_older_than_sb3_wants_it():
+def test_lower_bound_of_torch_is_not_below_that_of_sb3():
     [ours] = [one for one in declared() if one.name == "torch"]
     [theirs] = [one for one in map(Requirement, metadata.requires("stable-baselines3")) if one.name == "torch"]
     assert lower_bound(ours) >= lower_bound(theirs)
@@ -138,7 +135,7 @@ def test_every_file_of_the_package_is_in_the_wheel(site):
 
 
 @pytest.mark.parametrize("extra", PROGRAMS)
-def test_it_works_with_each_extra_alone(site, extra, tmp_path):
+def test_package_works_with_each_extra_alone(site, extra, tmp_path):
     [published] = metadata.distributions(name="sb3-sap", path=[str(site)])
     declared = brought_by(published, extra)
     owners = metadata.packages_distributions()
@@ -192,7 +189,7 @@ def append(path, text):
     path.write_text(path.read_text(encoding="utf-8") + text, encoding="utf-8")
 
 
-def test_a_release_changes_the_version_builds_and_tags(clone):
+def test_release_changes_the_version_builds_and_tags(clone):
     before = git(clone, "rev-parse", "HEAD")
     done = release(clone, "0.2.0")
     assert done.returncode == 0, done.stderr
@@ -208,7 +205,7 @@ def test_a_release_changes_the_version_builds_and_tags(clone):
     assert "### Added" in git(clone, "tag", "--list", "--format=%(contents)", "v0.2.0")
 
 
-def test_a_release_that_fails_changes_nothing(clone):
+def test_failing_release_changes_nothing(clone):
     setup = clone / "setup.cfg"
     text = setup.read_text(encoding="utf-8")
     assert text.count("attr: sb3_sap.__version__") == 1
@@ -230,7 +227,7 @@ def test_a_release_that_fails_changes_nothing(clone):
         ("0.2.0", lambda clone: git(clone, "tag", "v0.2.0"), "The tag v0.2.0 exists already"),
     ],
 )
-def test_a_release_that_cannot_be_made_is_refused(clone, version, change, sentence):
+def test_release_that_cannot_be_made_is_refused(clone, version, change, sentence):
     change(clone)
     before = git(clone, "rev-parse", "HEAD"), git(clone, "status", "--porcelain"), git(clone, "tag", "--list")
     done = release(clone, version)
@@ -240,7 +237,7 @@ def test_a_release_that_cannot_be_made_is_refused(clone, version, change, senten
     assert not (clone / "dist").exists()
 
 
-def test_a_section_without_entries_is_no_section(clone):
+def test_section_without_entries_does_not_count(clone):
     text = (clone / "CHANGELOG.md").read_text(encoding="utf-8")
     (clone / "CHANGELOG.md").write_text(
         text.replace("0.2.0", "0.1.0") + "\n## [0.2.0] - 2026-01-31\n", encoding="utf-8"

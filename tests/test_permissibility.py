@@ -1,12 +1,12 @@
+"""Labels: from the wrapper, from an AP function, and from info; functions that do not label are refused."""
+
 import re
 
 import numpy as np
 import pytest
-import toy
-from toy import GUIDED, Line, build
+from toy import GUIDED, Line, build, towards_centre
 
 from sb3_sap import DDPGAP, ActionPermissibility
-from sb3_sap.common.functions import resolve
 from sb3_sap.permissibility import labels_from_infos, query_labels
 
 
@@ -14,16 +14,16 @@ def closer(obs, action, next_obs):
     return bool(abs(next_obs[0]) <= abs(obs[0]))
 
 
-@pytest.mark.parametrize("reuse", [False, True], ids=["fresh arrays", "one array written over"])
+@pytest.mark.parametrize("reuse", [False, True], ids=["fresh arrays", "one array overwritten"])
 def test_wrapper_labels_with_the_observation_before_the_step(reuse):
-    env = ActionPermissibility(toy.Line(labels=False, reuse=reuse), closer)
+    env = ActionPermissibility(Line(labels=False, reuse=reuse), closer)
     env.reset(options={"x": 0.5})
     labels = [env.step(np.array([action]))[4]["permissible"] for action in (-1.0, 1.0, 1.0, -1.0)]
     assert labels == [True, False, False, True]  # x: 0.5 -> 0.4 -> 0.5 -> 0.6 -> 0.5
 
 
-def test_wrapper_starts_afresh_after_a_reset():
-    env = ActionPermissibility(toy.Line(labels=False, reuse=True), lambda obs, action, next_obs: float(obs[1]) == 0.0)
+def test_wrapper_takes_the_observation_of_a_reset():
+    env = ActionPermissibility(Line(labels=False, reuse=True), lambda obs, action, next_obs: float(obs[1]) == 0.0)
     env.reset(seed=0)
     assert env.step(np.array([0.0]))[4]["permissible"]  # time 0 at the reset
     assert not env.step(np.array([0.0]))[4]["permissible"]
@@ -31,45 +31,23 @@ def test_wrapper_starts_afresh_after_a_reset():
     assert env.step(np.array([0.0]))[4]["permissible"]
 
 
-def test_wrapper_hands_over_action_and_both_dict_observations():
+def test_wrapper_passes_the_action_and_both_dict_observations():
     seen = []
 
     def permissible(obs, action, next_obs):
         seen.append((obs["time"].item(), action.item(), next_obs["time"].item()))
         return True
 
-    env = ActionPermissibility(toy.Line("dict", labels=False), permissible)
+    env = ActionPermissibility(Line("dict", labels=False), permissible)
     env.reset(seed=0)
     info = env.step(np.array([0.25]))[4]
     assert info == {"permissible": True}
     assert seen == [(0.0, 0.25, pytest.approx(0.1))]
 
 
-def test_wrapper_wants_a_function():
+def test_wrapper_requires_a_function():
     with pytest.raises(TypeError, match=r"`permissible` must be a function \(obs, action, next_obs\) -> bool.*is True"):
-        ActionPermissibility(toy.Line(), True)
-
-
-def test_resolve_returns_functions_and_imports_names():
-    assert resolve(closer, "ap_function") is closer
-    assert resolve("toy.towards_centre", "ap_function") is toy.towards_centre
-
-
-@pytest.mark.parametrize(
-    ("given", "error", "message"),
-    [
-        (3, TypeError, r"`ap_function` must be a function or its dotted name .*, but is 3"),
-        ("towards_centre", TypeError, r"`ap_function` must be a function or its dotted name .*'towards_centre'"),
-        ("no_such_package.function", ValueError, r"`ap_function`: 'no_such_package.function' cannot be imported"),
-        ("toy.no_such_function", ValueError, r"`ap_function`: 'toy.no_such_function' cannot be imported"),
-        (".towards_centre", TypeError, r"`ap_function` must be a function or its dotted name .*'.towards_centre'"),
-        ("toy.", TypeError, r"`ap_function` must be a function or its dotted name .*'toy.'"),
-        ("toy.NOT_A_FUNCTION", TypeError, r"`ap_function`: 'toy.NOT_A_FUNCTION' names a int, but must name a function"),
-    ],
-)
-def test_resolve_says_what_was_expected(given, error, message):
-    with pytest.raises(error, match=message):
-        resolve(given, "ap_function")
+        ActionPermissibility(Line(), True)
 
 
 OBS = np.array([[1.0, 0.0], [1.0, 0.0]])
@@ -78,7 +56,7 @@ ACTIONS = np.array([[-1.0], [1.0]])
 
 
 def test_function_labels_are_returned_row_by_row():
-    np.testing.assert_array_equal(query_labels(toy.towards_centre, "ap_function", OBS, ACTIONS, NEXT), [True, False])
+    np.testing.assert_array_equal(query_labels(towards_centre, "ap_function", OBS, ACTIONS, NEXT), [True, False])
 
 
 def raises(obs, actions, next_obs):
@@ -106,7 +84,7 @@ def raises(obs, actions, next_obs):
         (lambda o, a, n: np.array([True]), ValueError, "returned an array of shape (1,) for 2 actions"),
     ],
 )
-def test_function_that_returns_no_labels_is_named(function, error, message):
+def test_invalid_return_values_are_refused(function, error, message):
     with pytest.raises(error, match=re.escape(message)):
         query_labels(function, "ap_function", OBS, ACTIONS, NEXT)
 
@@ -117,7 +95,7 @@ def test_info_labels_are_collected_in_the_order_of_the_environments():
     assert labels.dtype == bool
 
 
-def test_info_without_a_label_names_both_ways_out():
+def test_missing_label_in_info_is_refused_with_both_alternatives():
     with pytest.raises(ValueError, match=r"There is no AP function.*`ap_function=`.*ActionPermissibility"):
         labels_from_infos([{"permissible": True}, {}])
 
@@ -129,7 +107,7 @@ def test_info_label_must_be_bool(label):
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_no_ap_function_anywhere(algorithm):
+def test_missing_ap_function_is_refused_at_the_first_step(algorithm):
     model = build(algorithm, Line(labels=False))
     with pytest.raises(ValueError, match=r"^There is no AP function: .* Pass `ap_function=`"):
         model.learn(100)
@@ -157,13 +135,13 @@ def returns(value):
     ],
 )
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_ap_function_that_does_not_label(algorithm, ap_function, error, message):
+def test_invalid_ap_function_is_refused_at_the_first_step(algorithm, ap_function, error, message):
     model = build(algorithm, ap_function=ap_function)
     with pytest.raises(error, match=message):
         model.learn(100)
     assert model.num_timesteps == 1
 
 
-def test_a_wrapper_that_labels_with_numbers():
+def test_wrapper_that_labels_with_numbers_is_refused():
     with pytest.raises(TypeError, match=r'^`info\["permissible"\]` must be a bool, but is 1\.$'):
         build(DDPGAP, ActionPermissibility(Line(), lambda obs, action, next_obs: 1)).learn(100)

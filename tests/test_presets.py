@@ -1,4 +1,4 @@
-"""Presets come from zoo_configs; the paper's are those of section 5.1."""
+"""Presets are read from zoo_configs; those of the paper have the values of its section 5.1."""
 
 from importlib import resources
 
@@ -32,7 +32,7 @@ PAPER_GUIDANCE = {
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap", "ddpg_ap_ce2"])
-def test_paper_values(algo):
+def test_paper_preset_has_the_values_of_the_paper(algo):
     found = preset("paper", algo)
     expected = PAPER | (PAPER_GUIDANCE if "ap" in algo else {})
     assert {key: found[key] for key in expected} == expected
@@ -41,7 +41,7 @@ def test_paper_values(algo):
     assert ("predictor_kwargs" in found) == ("ap" in algo)
 
 
-def test_predictor_of_the_paper():
+def test_paper_preset_has_the_predictor_of_the_paper():
     predictor = preset("paper")["predictor_kwargs"]
     assert predictor == {
         "net_arch": [128, 256],
@@ -58,7 +58,7 @@ def test_t_k_follows_the_length_of_the_run():
     assert preset("paper", steps=3_000)["t_k"] == 150
 
 
-def test_preset_as_typed():
+def test_paper_preset_is_applied_to_a_model():
     env = gym.make("sap/LaneKeeping-v0")
     model = DDPGAP("MlpPolicy", env, **preset("paper"))
     assert model.predictor.optimizer.param_groups[0]["weight_decay"] == 0.01
@@ -69,20 +69,20 @@ def test_preset_as_typed():
 
 
 @pytest.mark.parametrize(("algo", "cls"), ALGORITHMS.items())
-def test_a_class_stands_for_its_name(algo, cls):
+def test_preset_of_a_class_is_that_of_its_name(algo, cls):
     derived = type("Mine", (cls,), {})
     for name in preset_names(algo):
         assert preset(name, cls) == preset(name, derived) == preset(name, algo)
     assert preset_names(derived) == preset_names(algo)
 
 
-def test_fast_is_another_for_each_algorithm():
+def test_fast_preset_differs_between_algorithms():
     assert preset("fast", TQCAP)["gamma"] == 0.8
     assert preset("fast", SACAP)["gamma"] == 0.9
     assert TQCAP("MlpPolicy", gym.make("sap/LaneKeeping-v0"), **preset("fast", TQCAP)).gamma == 0.8
 
 
-def test_every_algorithm_has_a_config_that_is_installed():
+def test_every_algorithm_has_an_installed_configuration():
     assert set(ALGORITHMS) <= set(algorithms()) <= set(CLASSES)
     for algo in ALGORITHMS:
         assert ("paper" in preset_names(algo)) == algo.startswith("ddpg")
@@ -105,6 +105,6 @@ def test_every_algorithm_has_a_config_that_is_installed():
         (("fast", dict), "`algo` = dict is neither"),
     ],
 )
-def test_unknown_names(arguments, message):
+def test_unknown_presets_and_algorithms_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         preset(*arguments)

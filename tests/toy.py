@@ -1,4 +1,4 @@
-"""A point on a line, whose every consequence can be computed in the head."""
+"""A point on a line: a problem in which every consequence can be computed in the head."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ALGORITHMS = (DDPG, DDPGCE1, DDPGCE2, *GUIDED)
 class Line(gym.Env[Any, Any]):
     """x' = x + 0.1·(mean of the action, scaled to [-1, 1]); permissible where |x'| <= |x|.
 
-    :param kind: "array" observes (x, steps / horizon), "dict" the same in two keys, "goal" as HER wants it
+    :param kind: "array" observes (x, steps / horizon), "dict" the same in two keys, "goal" as HER needs it
     :param low: lower bound of each of the ``dim`` actions
     :param high: upper bound of each
-    :param labels: whether ``info["permissible"]`` is there
-    :param reuse: whether every observation is the same array, written over
-    :param n_actions: so many actions, evenly from left to right, instead of continuous ones
+    :param labels: whether ``info`` holds "permissible"
+    :param reuse: whether every observation is the same array, overwritten
+    :param n_actions: that many discrete actions, evenly from left to right, instead of continuous ones
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Line(gym.Env[Any, Any]):
             "dict": spaces.Dict({"x": number, "time": number}),
             "goal": spaces.Dict({"observation": plain, "achieved_goal": number, "desired_goal": number}),
         }[kind]
-        self.executed: list[np.ndarray[Any, Any]] = []  # every action that ever arrived
+        self.executed: list[np.ndarray[Any, Any]] = []  # every action of any episode
         self._array = np.zeros(2, dtype=np.float32)
         self.x, self.steps = 0.0, 0
 
@@ -92,7 +92,7 @@ def towards_centre(obs: Any, actions: Any, next_obs: Any) -> Any:
 
 
 def nearby(obs: Any, previous_obs: Any, last_action: Any) -> tuple[Any, Any]:
-    """A stub constraint: within 0.5 of the action before."""
+    """A stub constraint: within 0.5 of the previous action."""
     return last_action - 0.5, last_action + 0.5
 
 

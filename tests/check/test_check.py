@@ -1,4 +1,4 @@
-"""check_permissibility, against consequences that can be computed in the head."""
+"""`check_permissibility`, on problems whose report can be computed in the head."""
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +15,7 @@ from sb3_sap.check.trials import N_ACTIONS
 
 @pytest.fixture(autouse=True)
 def fewer_fits(monkeypatch):
-    """The classifiers of these problems need no more."""
+    """These problems need few."""
     monkeypatch.setattr(classifier, "FITS", 40)
 
 
@@ -42,13 +42,13 @@ def steps_left(obs, actions, next_obs):
     ("x", "changes"),
     [(0.5, 1), (0.03, 2)],  # permissible: a <= 0, and -0.6 <= a <= 0
 )
-def test_label_changes_along_an_action(x, changes):
+def test_label_changes_are_counted_along_the_action(x, changes):
     report = check(FixedLine(x))
     assert report.action_matters == 1
     assert report.label_changes == changes
 
 
-def test_random_actions_of_one_half():
+def test_labels_that_permit_half_of_the_actions_get_no_advice():
     report = check(FixedLine(0.5), n_steps=2_000)
     assert report.permissible_rate == pytest.approx(0.5, abs=0.04)
     assert report.accuracy > 0.95
@@ -58,13 +58,13 @@ def test_random_actions_of_one_half():
 
 
 @pytest.mark.parametrize(("action", "forbidden"), [(-1, 0), (1, 1)])
-def test_share_of_the_policys_actions_that_are_forbidden(action, forbidden):
+def test_policy_forbidden_is_the_share_of_its_actions_that_are_not_permissible(action, forbidden):
     report = check(FixedLine(0.5), policy=lambda obs: np.full(1, action, dtype=np.float32))
     assert report.policy_forbidden == forbidden
     assert any("your policy's own actions" in sentence for sentence in report.advice) == bool(forbidden)
 
 
-def test_a_policy_of_sb3_is_asked_for_its_deterministic_action():
+def test_model_of_sb3_is_checked_with_its_deterministic_actions():
     env = FixedLine(0.5, n_actions=2)
     model = build(DQNAP, env, policy_kwargs={"net_arch": []}, exploration_initial_eps=1.0, exploration_final_eps=1.0)
     with th.no_grad():
@@ -73,34 +73,34 @@ def test_a_policy_of_sb3_is_asked_for_its_deterministic_action():
     assert check(env, policy=model).policy_forbidden == 0
 
 
-def test_discrete_actions_have_no_order():
-    report = check(FixedLine(0.5, n_actions=3))  # left, stay, right
+def test_discrete_actions_have_no_label_changes():
+    report = check(FixedLine(0.5, n_actions=3))  # left, none, right
     assert report.permissible_rate == pytest.approx(2 / 3, abs=0.08)
     assert report.action_matters == 1
     assert report.label_changes is None
 
 
 @pytest.mark.parametrize("kind", ["array", "dict", "goal"])
-def test_labels_by_info_and_by_function_agree(kind):
+def test_labels_from_info_and_from_a_function_give_the_same_report(kind):
     by_info = check(FixedLine(0.5, kind=kind))
     if kind != "goal":
         assert check(FixedLine(0.5, kind=kind, labels=False), towards_centre) == by_info
     assert check(FixedLine(0.5, kind=kind, labels=False, reuse=kind == "array"), "test_check.steps_left") == by_info
 
 
-def test_units_and_several_dimensions():
+def test_three_dimensions_in_other_units_inform_equally():
     report = check(FixedLine(0.5, dim=3, low=-20.0, high=60.0), n_steps=2_000)
-    # x' = x + 0.1 · mean: along one dimension a threshold, where the two others leave it any say; together they decide.
+    # x' = x + 0.1 · mean: along one dimension there is a threshold, unless the other two decide; together they decide.
     assert report.label_changes == 1
     assert report.action_matters == 1
     assert report.accuracy > 0.9
-    # Each has the same say.
+    # Each has the same influence.
     assert report.action_informs == pytest.approx([report.action_informs[0]] * 3, abs=0.08)
     assert min(report.action_informs) > 0.05
 
 
-def test_what_six_joints_decide_together():
-    """The label is a weighted sum, which one dimension seldom turns over when the others are far from the balance."""
+def test_action_matters_if_six_dimensions_decide_together():
+    """The label depends on a weighted sum, whose sign a single dimension can rarely change."""
     weights = np.ones(6)
     report = check(FixedLine(0.5, dim=6), lambda obs, actions, next_obs: actions @ weights > 0)
     assert report.action_matters == 1
@@ -108,16 +108,16 @@ def test_what_six_joints_decide_together():
     assert report.action_matters == 0
 
 
-def test_dimensions_that_say_nothing_are_named():
+def test_uninformative_dimensions_are_named():
     report = check(FixedLine(0.5, dim=3), lambda obs, actions, next_obs: actions[:, 1] > 0, n_steps=1_000)
     first, second, third = report.action_informs
-    assert second == pytest.approx(0.5, abs=0.08)  # shuffled, it is as good as a coin
+    assert second == pytest.approx(0.5, abs=0.08)  # if it is shuffled, the classifier is as good as a coin
     assert max(first, third) < 0.02
     assert "action[1] 4" in str(report) or "action[1] 5" in str(report)
     assert any("from action[0] and action[2]." in sentence for sentence in report.advice)
 
 
-def test_a_classifier_that_does_not_see_the_action():
+def test_accuracy_without_the_action_shows_whether_the_state_decides():
     decided_by_action = check(FixedLine(0.5), steps_left, n_steps=1_000)
     assert decided_by_action.accuracy_without_action == pytest.approx(0.5, abs=0.08)
     decided_by_state = check(Line(dim=2), lambda obs, actions, next_obs: obs[:, 1] < 0.45)
@@ -125,7 +125,7 @@ def test_a_classifier_that_does_not_see_the_action():
     assert len(decided_by_state.advice) == 1
 
 
-def test_the_steps_that_come_back_to_states_are_as_many_as_told(monkeypatch):
+def test_steps_that_return_to_states_are_as_many_as_documented(monkeypatch):
     monkeypatch.setattr(classifier, "FITS", 1)
 
     def steps(kind, function, **kwargs):
@@ -141,7 +141,7 @@ def test_the_steps_that_come_back_to_states_are_as_many_as_told(monkeypatch):
     assert steps(Line, lambda o, a, n: a.sum(axis=1) > 0, dim=2, **line) == pytest.approx(5_000, rel=0.25)
 
 
-def test_constant_labels():
+def test_constant_labels_get_one_advice():
     report = check(FixedLine(0.5), lambda obs, actions, next_obs: np.ones(len(actions), dtype=bool))
     assert report.permissible_rate == 1
     assert report.action_matters == 0
@@ -150,19 +150,19 @@ def test_constant_labels():
     assert "constant labels" in report.advice[0]
 
 
-def test_rare_labels_are_told_with_the_steps_they_take():
+def test_rare_labels_are_reported_with_the_steps_that_they_take():
     report = check(Line(horizon=100), lambda obs, actions, next_obs: next_obs[:, 1] < 0.995)  # every hundredth step
     assert report.permissible_rate == 0.99
     assert any("after about 2,000 steps" in sentence for sentence in report.advice)
 
 
-def test_labels_that_the_action_does_not_decide():
+def test_labels_that_do_not_depend_on_the_action_get_advice():
     report = check(Line(), lambda obs, actions, next_obs: obs[:, 1] < 0.45)
     assert report.action_matters == 0
     assert any("does the label depend on the action" in sentence for sentence in report.advice)
 
 
-def test_labels_that_cannot_be_predicted_are_rough():
+def test_unpredictable_labels_get_advice():
     def parity(obs, actions, next_obs):
         return np.floor(actions[:, 0] * 100).astype(int) % 7 < 4
 
@@ -174,7 +174,7 @@ def test_labels_that_cannot_be_predicted_are_rough():
 
 
 @pytest.mark.parametrize("trap", ["batch", "random"])
-def test_labels_that_depend_on_more_than_their_row(trap):
+def test_labels_that_depend_on_more_than_their_row_get_advice(trap):
     rng = np.random.default_rng(0)
 
     def function(obs, actions, next_obs):
@@ -185,18 +185,18 @@ def test_labels_that_depend_on_more_than_their_row(trap):
     assert any("in another order" in sentence for sentence in report.advice)
 
 
-def test_an_environment_that_forgets_its_seed():
-    class Forgetful(Line):
+def test_environment_that_ignores_its_seed_gets_no_trials_of_actions():
+    class IgnoresItsSeed(Line):
         def reset(self, *, seed=None, options=None):
             return super().reset(options={"x": np.random.default_rng().uniform(0.5, 1)})
 
-    report = check(Forgetful())
+    report = check(IgnoresItsSeed())
     assert report.action_matters is None
     assert report.label_changes is None
     assert report.permissible_rate > 0
 
 
-def test_the_same_seed_gives_the_same_report_and_the_callers_generators_are_left_alone():
+def test_same_seed_gives_the_same_report_and_global_generators_are_unchanged():
     th.manual_seed(3)
     before = th.rand(1)
     th.manual_seed(3)
@@ -206,14 +206,14 @@ def test_the_same_seed_gives_the_same_report_and_the_callers_generators_are_left
     assert one != another
 
 
-def test_the_report_is_printed(capsys):
+def test_report_is_printed(capsys):
     report = check_permissibility(FixedLine(0.5), n_steps=400)
     assert str(report) in capsys.readouterr().out
     assert "No problems found" in str(report)
 
 
-class Seen(gym.Env):
-    """Any observations, told at random; permissible is a step to the left."""
+class RandomObservations(gym.Env):
+    """Random observations of any space; a step to the left is permissible."""
 
     def __init__(self, observation_space):
         self.observation_space, self.action_space = observation_space, BOX
@@ -244,7 +244,7 @@ PICTURES = [spaces.Box(0, 255, shape, np.uint8) for shape in ((36, 36, 3), (3, 2
     ],
     ids=str,
 )
-def test_observations_that_sb3_takes(space, monkeypatch):
+def test_observation_spaces_of_sb3_can_be_checked(space, monkeypatch):
     monkeypatch.setattr(classifier, "FITS", 3)
     shapes = []
 
@@ -252,10 +252,10 @@ def test_observations_that_sb3_takes(space, monkeypatch):
         shapes.append({key: rows.shape[1:] for key, rows in obs.items()} if isinstance(obs, dict) else obs.shape[1:])
         return actions[:, 0] <= 0
 
-    report = check(Seen(space), steps_left, n_steps=200)
+    report = check(RandomObservations(space), steps_left, n_steps=200)
     assert report.action_matters == 1
     assert report.accuracy is not None
-    # The layout is the environment's own.
+    # The layout is that of the environment.
     assert shapes[0] == ({key: s.shape for key, s in space.spaces.items()} if space.shape is None else space.shape)
 
 
@@ -266,7 +266,7 @@ def with_spaces(**changes):
 
 
 class Answers(Line):
-    """An environment of another interface."""
+    """An environment whose methods return what is given."""
 
     def __init__(self, **answers):
         super().__init__()
@@ -312,7 +312,7 @@ class Answers(Line):
         ({"ap_function": "nowhere.nothing"}, ValueError, "cannot be imported"),
     ],
 )
-def test_what_cannot_be_checked_is_told(arguments, error, sentence):
+def test_what_cannot_be_checked_is_refused(arguments, error, sentence):
     with pytest.raises(error, match=sentence):
         check(**({"env": Line()} | arguments))
 
@@ -324,19 +324,19 @@ def energy_did_not_fall(obs, actions, next_obs):
     return energy(next_obs) >= energy(obs)
 
 
-def test_mountain_car(monkeypatch):
+def test_actions_against_the_motion_are_forbidden_in_mountain_car(monkeypatch):
     monkeypatch.setattr(classifier, "FITS", 120)
     env = gym.make("MountainCarContinuous-v0")
     with_velocity, against = (
         check(env, energy_did_not_fall, policy=lambda obs, sign=sign: sign * np.sign(obs[1:])) for sign in (1, -1)
     )
-    # Pushing against the motion loses energy; with it, only where the car hits the wall or Euler's steps are coarse.
+    # Pushing against the motion loses energy; pushing with it only at the wall, or where Euler's steps are coarse.
     assert with_velocity.policy_forbidden < 0.1 < 0.4 < against.policy_forbidden
     assert with_velocity.accuracy > 0.7
 
 
 def test_lane_keeping_forbids_good_actions_near_the_axis():
-    """Equation (6) is not what Definition 3 wants: on the axis itself every way leads away from it."""
+    """Equation (6) falls short of Definition 3: from the axis itself every motion leads away from it."""
     env = gym.make("sap/LaneKeeping-v0", laps=None)
 
     def linear(obs):
@@ -348,11 +348,11 @@ def test_lane_keeping_forbids_good_actions_near_the_axis():
     )
     assert strict.policy_forbidden > 0.1
     assert check(beside, policy=linear).policy_forbidden < strict.policy_forbidden / 2
-    assert N_ACTIONS % 2 == 1  # the sweep holds steering straight ahead
+    assert N_ACTIONS % 2 == 1  # the sweep contains steering straight ahead
 
 
 @pytest.mark.parametrize("algorithm", [DDPGAP, SACAP])
-def test_actions_without_a_dimension_work_here_as_in_training(algorithm):
+def test_actions_without_a_dimension_work_in_the_check_and_in_training(algorithm):
     env = Line(labels=False)
     env.action_space = spaces.Box(-1, 1, (), np.float32)
     report = check_permissibility(env, towards_centre, n_steps=200, verbose=False)

@@ -1,4 +1,4 @@
-"""The commands that a user types."""
+"""The commands `demo` and `evaluate`, and the errors of the command line."""
 
 import json
 import os
@@ -28,7 +28,7 @@ def demo(tmp_path_factory):
     return out
 
 
-def test_demo_leaves_what_it_promises(demo):
+def test_demo_writes_its_files(demo):
     names = {path.name for path in demo.iterdir()}
     pictures = {"learning_curve.png", "predictor.png", "lap.gif"}
     assert names == {"model.zip", "run.json", "training.csv", "evaluation.json"} | pictures
@@ -51,7 +51,7 @@ def test_evaluate_repeats_the_demos_laps(demo, tmp_path):
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap_ce2"])
-def test_every_algorithm_runs(algo, tmp_path):
+def test_demo_runs_with_every_variant_of_ddpg(algo, tmp_path):
     out = tmp_path / "out"
     assert main(["demo", "--algo", algo, "--steps", "60", "--no-animation", "--out", str(out)]) == 0
     assert not (out / "lap.gif").exists()
@@ -59,7 +59,7 @@ def test_every_algorithm_runs(algo, tmp_path):
 
 
 @pytest.mark.slow
-def test_same_seed_same_rows(demo, tmp_path):
+def test_saved_command_of_the_demo_gives_the_same_rows(demo, tmp_path):
     _, *words = shlex.split(json.loads((demo / "run.json").read_text())["command"])
     assert main([*words, "--out", str(tmp_path), "--no-animation"]) == 0
     assert (tmp_path / "training.csv").read_bytes() == (demo / "training.csv").read_bytes()
@@ -88,7 +88,7 @@ def test_wrong_usage_exits_with_2(arguments):
 
 
 @pytest.mark.parametrize("command", [[], ["demo"], ["evaluate"]])
-def test_help(command, capsys):
+def test_help_prints_the_usage(command, capsys):
     with pytest.raises(SystemExit, match="0"):
         main([*command, "--help"])
     assert "usage: sb3-sap" in capsys.readouterr().out
@@ -96,7 +96,7 @@ def test_help(command, capsys):
 
 def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     command = [sys.executable, "-m", "sb3_sap.cli.main", "demo", "--steps", "100000", "--out", str(tmp_path)]
-    for name in EXTRAS:  # of another model
+    for name in EXTRAS:  # files of another model
         (tmp_path / name).write_text("old")
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
     assert "learns 100,000 steps" in process.stdout.readline()
@@ -113,7 +113,7 @@ def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     assert command.endswith(f"# interrupted after {taken} steps")
 
 
-def test_table_shows_the_papers_row():
+def test_demo_table_shows_the_result_of_the_paper():
     console = Console(width=150, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(results_table([LapResult("eroad", False, 0.5, -10.0, -0.001, 7)], "ddpg", 3_000))
     text = console.export_text()

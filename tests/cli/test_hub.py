@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import gymnasium as gym
 import numpy as np
@@ -24,7 +25,7 @@ COMMAND = "sb3-sap demo --algo ddpg_ap --seed 3"
 
 @pytest.fixture
 def run(tmp_path):
-    """What a demo leaves."""
+    """The files of a demo."""
     folder = tmp_path / "demo_output"
     folder.mkdir()
     build(DDPGAP).save(folder / "model.zip")
@@ -36,7 +37,7 @@ def run(tmp_path):
 
 @pytest.fixture
 def uploads(monkeypatch):
-    """What would go over the network."""
+    """Records what would be uploaded."""
     calls = []
 
     def create_repo(api, repo_id, **kwargs):
@@ -50,7 +51,7 @@ def uploads(monkeypatch):
     return calls
 
 
-#: How RL Zoo writes what a run was given.
+#: The format in which RL Zoo saves the arguments of a run.
 SAVED = "!!python/object/apply:collections.OrderedDict\n- - - {}\n    - {}\n"
 
 
@@ -58,7 +59,7 @@ def push(*arguments):
     return main(["push-to-hub", *map(str, arguments)])
 
 
-def test_everything_is_uploaded_and_the_card_comes_last(run, uploads):
+def test_all_files_are_uploaded_and_the_card_comes_last(run, uploads):
     assert push(run, "--repo-id", "me/car") == 0
     files = [name for name, repo_id in uploads if name != "create" and repo_id == "me/car"]
     model = "ddpg_ap-sap-TorcsLaneKeeping-v0.zip"
@@ -66,7 +67,7 @@ def test_everything_is_uploaded_and_the_card_comes_last(run, uploads):
     assert (run / "hub" / model).read_bytes() == (run / "model.zip").read_bytes()
 
 
-def test_the_card_tells_results_command_and_use(run, uploads):
+def test_card_has_results_command_and_usage(run, uploads):
     assert push(run, "--repo-id", "me/car", "--dry-run") == 0
     assert uploads == []
     card = ModelCard.load(run / "hub" / "README.md")
@@ -77,13 +78,13 @@ def test_the_card_tells_results_command_and_use(run, uploads):
     assert "| spring | 50.0% | 0.400 |" in card.text
     assert f"```\n{COMMAND}\n```" in card.text
     assert "![predictor](predictor.png)" in card.text
-    assert "lap.gif" not in card.text  # the run left none
+    assert "lap.gif" not in card.text  # the run wrote none
     assert 'DDPGAP.load(load_from_hub("me/car", "ddpg_ap-sap-TorcsLaneKeeping-v0.zip"))' in card.text
 
 
 @pytest.fixture
 def zoo_run(tmp_path):
-    """What `sb3-sap train` leaves."""
+    """The files of `sb3-sap train`."""
     from stable_baselines3 import DDPG
 
     folder = tmp_path / "Pendulum-v1_1"
@@ -98,7 +99,7 @@ def zoo_run(tmp_path):
     return folder
 
 
-def test_it_is_evaluated_with_the_options_of_its_run(zoo_run):
+def test_model_is_evaluated_with_the_env_kwargs_of_its_run(zoo_run):
     assert find_trained(zoo_run, None, None, None).env_kwargs == {"g": 9.81}
     (zoo_run / "Pendulum-v1" / "args.yml").write_text(SAVED.format("env_kwargs", "{g: 5}"))
     assert find_trained(zoo_run, None, None, None).env_kwargs == {"g": 5}
@@ -107,7 +108,7 @@ def test_it_is_evaluated_with_the_options_of_its_run(zoo_run):
         prepare(find_trained(zoo_run, None, None, None), "me/p", zoo_run / "hub", 1)
 
 
-def test_a_run_of_the_zoo_says_everything_by_itself(zoo_run):
+def test_run_of_rl_zoo_needs_no_further_arguments(zoo_run):
     assert push(zoo_run, "--repo-id", "me/p", "--dry-run", "--episodes", 1) == 0
     card = ModelCard.load(zoo_run / "hub" / "README.md")
     assert card.data.eval_results[0].dataset_name == "Pendulum-v1"
@@ -117,12 +118,15 @@ def test_a_run_of_the_zoo_says_everything_by_itself(zoo_run):
     assert (zoo_run / "hub" / "ddpg-Pendulum-v1.zip").is_file()
 
 
-def test_the_best_model_of_a_zoo_run_goes_first(zoo_run):
-    (zoo_run / "Pendulum-v1.zip").rename(zoo_run / "best_model.zip")
+def test_best_model_of_an_rl_zoo_run_is_preferred(zoo_run):
+    final = zoo_run / "Pendulum-v1.zip"
+    shutil.copy(final, zoo_run / "best_model.zip")
+    assert find_trained(zoo_run, None, None, None).model == zoo_run / "best_model.zip"
+    final.unlink()
     assert push(zoo_run, "--repo-id", "me/p", "--dry-run", "--episodes", 1) == 0
 
 
-def test_statistics_go_along_and_the_card_loads_both(zoo_run, uploads, monkeypatch):
+def test_statistics_are_uploaded_and_the_card_loads_them_with_the_model(zoo_run, uploads, monkeypatch):
     statistics = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
     statistics.obs_rms.mean = np.array([0.1, 0.2, 3.0])
     statistics.save(zoo_run / "Pendulum-v1" / "vecnormalize.pkl")
@@ -141,21 +145,21 @@ def test_statistics_go_along_and_the_card_loads_both(zoo_run, uploads, monkeypat
     assert model.get_vec_normalize_env() is env
     assert env.obs_rms.mean.tolist() == [0.1, 0.2, 3.0]
     assert not env.training
-    assert env.get_attr("g") == [9.81]  # of the run's entry
+    assert env.get_attr("g") == [9.81]  # from the entry of the run
     obs = np.array([[0.5, 0.5, 2.0]], dtype=np.float32)
     expected = model.predict(env.normalize_obs(obs), deterministic=True)[0]
     loaded = load_policy(zoo_run / "Pendulum-v1.zip")
     assert np.array_equal(loaded.predict(obs, deterministic=True)[0], expected)
 
 
-def test_statistics_that_are_missing_are_asked_for(run, uploads, capsys):
+def test_missing_statistics_are_requested(run, uploads, capsys):
     build(DDPGAP, VecNormalize(DummyVecEnv([Line]))).learn(12).save(run / "model.zip")
     assert push(run, "--repo-id", "me/car") == 1
     assert "give them with `--vecnormalize FILE`" in capsys.readouterr().err
     assert uploads == []
 
 
-def test_any_other_model_is_evaluated(tmp_path, uploads):
+def test_other_models_are_evaluated_with_the_given_arguments(tmp_path, uploads):
     from stable_baselines3 import DDPG
 
     DDPG("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [4]}, buffer_size=10).save(tmp_path / "pendulum")
@@ -174,19 +178,19 @@ def test_any_other_model_is_evaluated(tmp_path, uploads):
         (["--repo-id", "me/car", "--algo", "dppg"], "did you mean 'ddpg'"),
     ],
 )
-def test_what_cannot_be_pushed_is_told(run, uploads, capsys, arguments, sentence):
+def test_invalid_arguments_are_refused(run, uploads, capsys, arguments, sentence):
     assert push(run, *arguments) == 1
     assert sentence in capsys.readouterr().err
     assert uploads == []
 
 
-def test_an_unknown_environment_cannot_be_evaluated(run, uploads, capsys):
+def test_unknown_environment_is_refused(run, uploads, capsys):
     (run / "evaluation.json").unlink()
     assert push(run, "--repo-id", "me/car", "--env", "Pendulum-v9") == 1
     assert "Pendulum" in capsys.readouterr().err
 
 
-def test_what_a_file_does_not_say_is_asked_for(run, uploads, capsys):
+def test_missing_information_is_requested(run, uploads, capsys):
     (run / "run.json").unlink()
     assert push(run, "--repo-id", "me/car") == 1
     assert "add --algo and --env and --command" in capsys.readouterr().err

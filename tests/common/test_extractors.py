@@ -1,3 +1,5 @@
+"""The extractor that rescales observations, and extractors that are given by name."""
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ CAR = "MountainCarContinuous-v0"
 NAMED = {"net_arch": [4], "features_extractor_class": "sb3_sap.RescaleExtractor"}
 
 
-def test_bounds_become_one_and_what_has_none_stays_as_it_is():
+def test_rescale_extractor_scales_bounded_entries_and_leaves_unbounded_ones():
     huge = np.finfo(np.float32).max
     low, high = [-1.2, -0.07, -np.inf, 0, -huge, 3], [0.6, 0.07, np.inf, np.inf, huge, 3]
     extractor = RescaleExtractor(spaces.Box(np.float32(low), np.float32(high), dtype=np.float32))
@@ -22,22 +24,22 @@ def test_bounds_become_one_and_what_has_none_stays_as_it_is():
 
 
 @pytest.mark.filterwarnings("error")
-def test_bounds_beyond_single_precision_are_none():
+def test_bounds_beyond_single_precision_count_as_unbounded():
     extractor = RescaleExtractor(spaces.Box(-1e300, 1e300, (1,), np.float64))
     np.testing.assert_array_equal(extractor(th.tensor([[5.0]])), [[5.0]])
 
 
-def test_it_flattens():
+def test_rescale_extractor_flattens_observations():
     extractor = RescaleExtractor(spaces.Box(-2, 2, (2, 2), np.float32))
     np.testing.assert_allclose(extractor(th.tensor([[[2.0, 1.0], [0.0, -2.0]]])), [[1, 0.5, 0, -1]])
 
 
-def test_named_as_in_yaml_policy_and_predictor_share_it_and_a_saved_model_keeps_it(tmp_path):
+def test_extractor_given_by_name_is_used_by_policy_and_predictor_and_kept_in_the_file(tmp_path):
     env = gym.make(CAR)
     model = DDPGAP("MlpPolicy", env, ap_function=mountain_car_continuous, policy_kwargs=NAMED, seed=0)
     for network in (model.actor, model.critic, model.predictor):
         assert type(network.features_extractor) is RescaleExtractor
-    assert NAMED["features_extractor_class"] == "sb3_sap.RescaleExtractor"  # the caller's dictionary is left alone
+    assert NAMED["features_extractor_class"] == "sb3_sap.RescaleExtractor"  # the caller's dictionary is not modified
     model.save(tmp_path / "model")
     loaded = DDPGAP.load(tmp_path / "model", env)
     obs = env.observation_space.sample()
@@ -45,7 +47,7 @@ def test_named_as_in_yaml_policy_and_predictor_share_it_and_a_saved_model_keeps_
     assert type(loaded.actor.features_extractor) is RescaleExtractor
 
 
-def test_the_predictor_may_have_another_one():
+def test_predictor_can_have_another_extractor():
     plain = {"features_extractor_class": "stable_baselines3.common.torch_layers.FlattenExtractor"}
     env = gym.make(CAR)
     model = DDPGAP(
@@ -58,12 +60,12 @@ def test_the_predictor_may_have_another_one():
 @pytest.mark.parametrize(
     "space", [spaces.Discrete(3), spaces.Dict({"x": spaces.Box(-1, 1)}), spaces.Box(0, 255, (36, 36, 3), np.uint8)]
 )
-def test_other_observations_are_refused_in_a_sentence(space):
+def test_rescale_extractor_refuses_other_observation_spaces(space):
     with pytest.raises(ValueError, match=r"^RescaleExtractor is for arrays of numbers, but .*leave `features_extr"):
         RescaleExtractor(space)
 
 
-def test_an_extractor_that_cannot_be_imported_is_refused_in_a_sentence():
+def test_extractor_that_cannot_be_imported_is_refused():
     wrong = {"features_extractor_class": "sb3_sap.RescaleExtractr"}
     with pytest.raises(ValueError, match=r"^`features_extractor_class`: 'sb3_sap\.RescaleExtractr' cannot be imported"):
         DDPGAP("MlpPolicy", gym.make(CAR), ap_function=mountain_car_continuous, policy_kwargs=wrong)

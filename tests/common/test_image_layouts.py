@@ -1,3 +1,5 @@
+"""The user's functions get images in the environment's own layout, whichever the policy uses."""
+
 import io
 
 import gymnasium as gym
@@ -17,7 +19,7 @@ from sb3_sap import DQNAP, SACAP
 
 
 class Camera(gym.Env):
-    """The pixel in row 1, column 2 holds in channel 0 the last action, 0 or 200; the others tell where they are."""
+    """In channel 0, the pixel in row 1 and column 2 is 200 after a positive action; everything else is 0."""
 
     def __init__(self, discrete=True, keyed=False, channels_first=False):
         self.keyed, self.channels_first = keyed, channels_first
@@ -44,7 +46,7 @@ class Camera(gym.Env):
 
 
 class Shapes:
-    """An AP function, or a rule, that remembers what it saw."""
+    """An AP function, permissible actions and a constraint, which record the shapes of the images that they get."""
 
     def __init__(self):
         self.seen = set()
@@ -77,7 +79,7 @@ def pictures(algorithm, env, policy="CnnPolicy", **settings):
 
 @pytest.mark.parametrize("keyed", [False, True])
 @pytest.mark.parametrize("algorithm", [DQNAP, SACAP])
-def test_functions_see_images_as_the_environment_gives_them(algorithm, keyed):
+def test_functions_get_images_in_the_layout_of_the_environment(algorithm, keyed):
     shapes = Shapes()
     env = Camera(discrete=algorithm is DQNAP, keyed=keyed)
     settings = {} if algorithm is DQNAP else {"constraint": shapes.interval}
@@ -91,7 +93,7 @@ def test_functions_see_images_as_the_environment_gives_them(algorithm, keyed):
     assert shapes.seen == {(36, 40, 3)}
 
 
-def test_a_loaded_model_knows_the_layout_without_an_environment():
+def test_loaded_model_keeps_the_layout_without_an_environment():
     shapes, file = Shapes(), io.BytesIO()
     pictures(DQNAP, Camera(), ap_function=Shapes().bright).learn(30).save(file)
     file.seek(0)
@@ -101,7 +103,7 @@ def test_a_loaded_model_knows_the_layout_without_an_environment():
 
 
 @pytest.mark.parametrize("order", ["transposed, stacked", "stacked"])
-def test_frame_stacks_are_seen_channels_last(order):
+def test_functions_get_stacked_frames_channels_last(order):
     shapes = Shapes()
     env = DummyVecEnv([Camera])
     env = VecFrameStack(VecTransposeImage(env), 4) if order.startswith("transposed") else VecFrameStack(env, 4)
@@ -110,13 +112,13 @@ def test_frame_stacks_are_seen_channels_last(order):
     assert min(model.replay_buffer.knowledge.seen) > 3
 
 
-def test_channels_first_stay_first():
+def test_functions_get_channels_first_images_unchanged():
     shapes = Shapes()
     pictures(DQNAP, Camera(channels_first=True), ap_function=lambda o, a, n: shapes.look(n)[:, 0, 1, 2] > 0).learn(20)
     assert shapes.seen == {(3, 36, 40)}
 
 
-def test_images_beside_normalised_numbers_need_the_transposition_inside():
+def test_images_beside_normalised_numbers_require_the_transposition_inside_vec_normalize():
     env = DummyVecEnv([lambda: Camera(keyed=True)])
     with pytest.raises(ValueError, match=r"VecNormalize\(VecTransposeImage\(env, ...\), ...\)"):
         pictures(DQNAP, VecNormalize(env, norm_obs_keys=["v"]), "MultiInputPolicy")

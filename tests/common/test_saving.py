@@ -1,3 +1,5 @@
+"""A loaded model continues like the saved one, and a file that cannot be loaded is refused in one sentence."""
+
 import json
 import threading
 import zipfile
@@ -9,17 +11,17 @@ import torch as th
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from states import assert_same, flat, reseed
+from states import assert_same_state, flat, reseed
 from toy import ALGORITHMS, CONSTRAINED, GUIDED, Line, build, nearby, towards_centre
 
 from sb3_sap import DDPG, DDPGAP, DDPGAPCE2, SACAP, TQCAP, PermissibilityNStepReplayBuffer
 
 
-# SB3 warns when it loads an n-step model of its own, though it does restore n_steps.
+# SB3 warns when it loads an n-step model, although it restores n_steps.
 @pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored")
 @pytest.mark.parametrize("n_steps", [1, 3])
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_save_load_and_continue_equals_an_interruption(algorithm, n_steps, tmp_path):
+def test_loaded_model_continues_like_the_saved_one(algorithm, n_steps, tmp_path):
     settings = {"alpha_low": 0.3, "knowledge_buffer_size": 60} if algorithm in GUIDED else {}
     model = build(algorithm, action_noise=NormalActionNoise(np.zeros(1), 0.2 * np.ones(1)), n_steps=n_steps, **settings)
     model.learn(120)
@@ -27,18 +29,18 @@ def test_save_load_and_continue_equals_an_interruption(algorithm, n_steps, tmp_p
     model.save_replay_buffer(tmp_path / "buffer")
     loaded = algorithm.load(tmp_path / "model", env=Line())
     loaded.load_replay_buffer(tmp_path / "buffer")
-    assert_same(model, loaded)
+    assert_same_state(model, loaded)
     for one in (model, loaded):
         reseed(one)
         one.learn(60, reset_num_timesteps=False)
     assert model.num_timesteps == 180
-    assert_same(model, loaded)
+    assert_same_state(model, loaded)
     if algorithm in GUIDED:
         assert model.predictor.fitted
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_a_second_learn_after_loading_stays_guided(algorithm, tmp_path):
+def test_second_learn_after_loading_has_no_second_warm_up(algorithm, tmp_path):
     model = build(algorithm).learn(60)
     assert model.predictor.fitted
     model.save(tmp_path / "model")
@@ -52,7 +54,7 @@ def test_a_second_learn_after_loading_stays_guided(algorithm, tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_loaded_model_predicts_the_same_without_an_environment(algorithm, tmp_path):
+def test_loaded_model_predicts_the_same_without_an_environment(algorithm, tmp_path):
     model = build(algorithm).learn(30)
     model.save(tmp_path / "model")
     obs = np.random.default_rng(0).normal(size=(20, 2)).astype(np.float32)
@@ -60,7 +62,7 @@ def test_a_loaded_model_predicts_the_same_without_an_environment(algorithm, tmp_
     np.testing.assert_array_equal(loaded, own)
 
 
-def test_load_can_change_settings(tmp_path):
+def test_load_changes_settings_and_checks_them(tmp_path):
     build(DDPGAP).learn(20).save(tmp_path / "model")
     model = DDPGAP.load(tmp_path / "model", alpha=0.25, t_k=3, n_candidates=7)
     assert (model.alpha, model.noise_steps, model.n_candidates) == (0.25, 3, 7)
@@ -68,7 +70,7 @@ def test_load_can_change_settings(tmp_path):
         DDPGAP.load(tmp_path / "model", alpha=2)
 
 
-def test_load_for_another_number_of_environments(tmp_path):
+def test_load_accepts_another_number_of_environments(tmp_path):
     build(DDPGAPCE2).learn(30).save(tmp_path / "model")
     env = stable_baselines3.common.vec_env.DummyVecEnv([Line] * 3)
     model = DDPGAPCE2.load(tmp_path / "model", env=env).learn(60)
@@ -77,7 +79,7 @@ def test_load_for_another_number_of_environments(tmp_path):
 
 @pytest.mark.parametrize("value", ["lin_0.001", 0.001])
 @pytest.mark.parametrize("name", ["learning_rate", "actor_learning_rate", "actor_permissibility_coef"])
-def test_schedules_can_be_given_to_load_too(name, value, tmp_path):
+def test_load_accepts_schedules(name, value, tmp_path):
     build(DDPGAP).learn(20).save(tmp_path / "model")
     model = DDPGAP.load(tmp_path / "model", env=Line(), **{name: value})
     schedule = getattr(model, name)
@@ -87,14 +89,14 @@ def test_schedules_can_be_given_to_load_too(name, value, tmp_path):
         DDPGAP.load(tmp_path / "model", **{name: "falling"})
 
 
-def test_another_return_can_be_loaded(tmp_path):
+def test_load_changes_n_steps_and_gamma_of_the_replay_buffer(tmp_path):
     build(DDPGAP, n_steps=4, gamma=0.8).learn(20).save(tmp_path / "model")
     for n_steps in (1, 2):
         buffer = DDPGAP.load(tmp_path / "model", n_steps=n_steps, gamma=0.5).replay_buffer
         assert (buffer.n_steps, buffer.gamma) == (n_steps, 0.5)
 
 
-def test_an_n_step_model_stays_one(tmp_path):
+def test_loaded_n_step_model_keeps_its_n_step_buffer(tmp_path):
     build(DDPGAP, n_steps=4, gamma=0.8).save(tmp_path / "model")
     buffer = DDPGAP.load(tmp_path / "model").replay_buffer
     assert type(buffer) is PermissibilityNStepReplayBuffer
@@ -102,7 +104,7 @@ def test_an_n_step_model_stays_one(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_parameters_contain_the_predictor_and_can_be_set(algorithm):
+def test_set_parameters_restores_the_predictor(algorithm):
     trained, fresh = build(algorithm).learn(80), build(algorithm, seed=2)
     parameters = trained.get_parameters()
     assert set(parameters) >= {"policy", "actor.optimizer", "critic.optimizer", "predictor", "predictor.optimizer"}
@@ -113,7 +115,7 @@ def test_parameters_contain_the_predictor_and_can_be_set(algorithm):
     assert fresh.predictor.fitted
 
 
-def test_parameters_of_the_optimizer_are_those_of_the_network_after_loading(tmp_path):
+def test_loaded_optimizer_holds_the_parameters_of_the_loaded_predictor(tmp_path):
     build(DDPGAP).learn(40).save(tmp_path / "model")
     predictor = DDPGAP.load(tmp_path / "model").predictor
     in_optimizer = {id(p) for group in predictor.optimizer.param_groups for p in group["params"]}
@@ -121,7 +123,7 @@ def test_parameters_of_the_optimizer_are_those_of_the_network_after_loading(tmp_
 
 
 @pytest.mark.parametrize("plain", [DDPG, stable_baselines3.DDPG])
-def test_plain_and_guided_files_are_told_apart(plain, tmp_path):
+def test_plain_and_guided_classes_refuse_the_files_of_each_other(plain, tmp_path):
     build(plain).learn(20).save(tmp_path / "plain")
     build(DDPGAP).learn(20).save(tmp_path / "guided")
     with pytest.raises(TypeError, match=r"no AP predictor.*a plain algorithm saved them.*exact_match=False"):
@@ -132,7 +134,7 @@ def test_plain_and_guided_files_are_told_apart(plain, tmp_path):
         build(DDPGAP).set_parameters(tmp_path / "plain")
 
 
-def test_the_way_from_plain_to_guided(tmp_path):
+def test_guided_model_takes_over_the_parameters_of_a_plain_one(tmp_path):
     plain = build(DDPG).learn(40)
     plain.save(tmp_path / "plain")
     model = build(DDPGAP, seed=2)
@@ -145,7 +147,7 @@ def test_the_way_from_plain_to_guided(tmp_path):
     model.learn(40)
 
 
-def test_other_mismatches_are_still_refused():
+def test_incomplete_parameters_are_refused():
     model = build(DDPGAP)
     parameters = model.get_parameters()
     del parameters["policy"]
@@ -158,7 +160,7 @@ def data_of(path):
         return json.loads(file.read("data")), file.namelist()
 
 
-def test_a_dotted_name_is_stored_as_that_name(tmp_path):
+def test_function_given_by_dotted_name_is_saved_as_that_name(tmp_path):
     model = build(DDPGAPCE2, Line(labels=False), ap_function="toy.towards_centre", constraint="toy.nearby").learn(20)
     assert model.replay_buffer.ap_function is towards_centre
     model.save(tmp_path / "model")
@@ -174,7 +176,7 @@ def test_a_dotted_name_is_stored_as_that_name(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_model_file_holds_no_buffer_and_no_network_twice(algorithm, tmp_path):
+def test_model_file_holds_no_buffer_and_no_network_twice(algorithm, tmp_path):
     model = build(algorithm, buffer_size=20_000).learn(20)
     model.save(tmp_path / "model")
     data, names = data_of(tmp_path / "model.zip")
@@ -185,7 +187,7 @@ def test_the_model_file_holds_no_buffer_and_no_network_twice(algorithm, tmp_path
         assert "constraint" in data
 
 
-def test_checkpoints_load(tmp_path):
+def test_checkpoint_can_be_loaded_with_its_replay_buffer(tmp_path):
     callback = CheckpointCallback(20, str(tmp_path), "run", save_replay_buffer=True)
     model = build(DDPGAP).learn(40, callback=callback)
     loaded = DDPGAP.load(tmp_path / "run_40_steps", env=Line())
@@ -198,13 +200,13 @@ def test_checkpoints_load(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", [DDPG, DDPGAP])
-def test_a_truncated_file_gives_one_clear_error(algorithm, tmp_path):
+def test_truncated_file_is_refused(algorithm, tmp_path):
     path = tmp_path / "model.zip"
     build(algorithm).save(path)
     whole = path.read_bytes()
     for length in [*range(0, len(whole), 1009), len(whole) - 1]:
         path.write_bytes(whole[:length])
-        # torch's files are archives of their own: cut behind one, the file still looks like an archive.
+        # Truncated after an embedded torch archive, the file still looks like a valid zip.
         with pytest.raises(ValueError, match=r"model\.zip.* (wasn't a zip-file|holds no whole model)"):
             algorithm.load(path)
     path.write_bytes(whole)
@@ -239,7 +241,7 @@ def test_load_applies_new_settings_of_the_predictors_optimizer(tmp_path):
     ],
     ids=str,
 )
-def test_load_refuses_another_predictor(tmp_path, changed, names):
+def test_load_refuses_settings_of_another_predictor(tmp_path, changed, names):
     build(DDPGAP).learn(30).save(tmp_path / "model")
     with pytest.raises(ValueError, match=f"^`predictor_kwargs` change {names} of a saved.*build a new DDPGAP"):
         DDPGAP.load(tmp_path / "model", predictor_kwargs={"net_arch": [8], "batch_size": 16, **changed})
@@ -254,7 +256,7 @@ def test_set_parameters_keeps_the_models_own_settings_and_refuses_another_optimi
         build(DDPGAP, predictor_kwargs={"net_arch": [8], "optimizer_class": "SGD"}).set_parameters(tmp_path / "model")
 
 
-def test_load_heeds_a_new_seed(tmp_path):
+def test_load_applies_a_new_seed(tmp_path):
     build(DDPGAP).learn(60).save(tmp_path / "model")
 
     def draws(**settings):
@@ -262,11 +264,11 @@ def test_load_heeds_a_new_seed(tmp_path):
         return model.exploration_rng.random(), model.replay_buffer.knowledge.rng.random()
 
     assert draws(seed=5) == draws(seed=5) != draws(seed=6)
-    assert draws()[0] == draws()[0]  # goes on where the saved one was
+    assert draws()[0] == draws()[0]  # continues where the saved generator was
 
 
 @pytest.mark.parametrize("name", ["ap_function", "permissible_actions", "constraint"])
-def test_a_function_that_cannot_be_pickled_is_told_at_construction_and_costs_no_checkpoint(tmp_path, name):
+def test_function_that_cannot_be_pickled_warns_at_construction_and_is_left_out_of_the_file(tmp_path, name):
     lock = threading.Lock()
     functions = {
         "ap_function": lambda obs, actions, next_obs: lock and towards_centre(obs, actions, next_obs),
@@ -286,7 +288,7 @@ def test_a_function_that_cannot_be_pickled_is_told_at_construction_and_costs_no_
     ("algorithm", "changed"),
     [(SACAP, {"ent_coef": 0.2}), (SACAP, {"ent_coef": "auto_0.5"}), (TQCAP, {"use_sde": True})],
 )
-def test_load_refuses_what_the_file_holds_the_effect_of(tmp_path, algorithm, changed):
+def test_load_refuses_settings_whose_effect_is_in_the_saved_state(tmp_path, algorithm, changed):
     model = build(algorithm).learn(20)
     model.save(tmp_path / "model")
     [name] = changed
@@ -298,7 +300,7 @@ def test_load_refuses_what_the_file_holds_the_effect_of(tmp_path, algorithm, cha
 
 
 @pytest.mark.parametrize("n_steps", [(1, 3), (3, 1)])
-def test_load_applies_other_n_steps(tmp_path, n_steps):
+def test_model_loaded_with_other_n_steps_learns_with_them(tmp_path, n_steps):
     build(DDPGAP, n_steps=n_steps[0]).learn(20).save(tmp_path / "model")
     loaded = DDPGAP.load(tmp_path / "model", env=Line(), n_steps=n_steps[1]).learn(20)
     assert getattr(loaded.replay_buffer, "n_steps", 1) == n_steps[1]
@@ -313,7 +315,7 @@ class Activated(FlattenExtractor):
         return self.activation(super().forward(observations))
 
 
-def test_a_network_whose_arguments_are_functions_loads_as_it_was_saved(tmp_path):
+def test_network_with_functions_as_arguments_can_be_loaded(tmp_path):
     arguments = {"features_extractor_class": Activated, "features_extractor_kwargs": {"activation": lambda x: x.tanh()}}
     model = build(DDPGAP, policy_kwargs={"net_arch": [8], **arguments}).learn(30)
     model.save(tmp_path / "model")
@@ -321,7 +323,7 @@ def test_a_network_whose_arguments_are_functions_loads_as_it_was_saved(tmp_path)
     DDPGAP.load(tmp_path / "model", predictor_kwargs={"net_arch": (8,), "optimizer_class": th.optim.Adam})
 
 
-def test_a_file_of_another_version_of_torch_still_loads():
+def test_optimizer_state_of_another_torch_version_can_be_loaded():
     model = build(DDPGAP).learn(60)
     for key in ("decoupled_weight_decay", "a setting of tomorrow"):
         parameters = model.get_parameters()
@@ -344,7 +346,7 @@ def test_a_file_of_another_version_of_torch_still_loads():
         (lambda path: DDPGAP.load(path).learn(10), ValueError, "This model has no environment to learn in"),
     ],
 )
-def test_mistakes_with_saved_models(tmp_path, act, error, sentence):
+def test_mistakes_with_saved_models_get_one_sentence(tmp_path, act, error, sentence):
     build(DDPGAP).learn(20).save(tmp_path / "model")
     with pytest.raises(error, match=sentence):
         act(tmp_path / "model")

@@ -1,4 +1,4 @@
-"""Every mistake gets one sentence that names the argument and what was expected, before training is lost."""
+"""Invalid settings are refused in the constructor, in one sentence that names the setting and what was expected."""
 
 import pytest
 import sb3_contrib
@@ -10,13 +10,13 @@ from sb3_sap import DDPGAP, SACAP, ActionPermissibilityMixin, ConstrainedExplora
 
 
 @pytest.mark.parametrize("name", ["no_module.f", "toy.missing", "missing", 3])
-def test_ap_function_that_cannot_be_found_fails_in_the_constructor(name):
+def test_ap_function_that_cannot_be_imported_is_refused_in_the_constructor(name):
     with pytest.raises((TypeError, ValueError), match=r"^`ap_function`"):
         build(DDPGAP, ap_function=name)
 
 
 @pytest.mark.parametrize("algorithm", CONSTRAINED)
-def test_constraint_that_cannot_be_found_fails_in_the_constructor(algorithm):
+def test_constraint_that_cannot_be_imported_is_refused_in_the_constructor(algorithm):
     with pytest.raises(ValueError, match=r"^`constraint`: 'toy\.missing' cannot be imported"):
         build(algorithm, constraint="toy.missing")
 
@@ -61,17 +61,17 @@ def test_constraint_that_cannot_be_found_fails_in_the_constructor(algorithm):
     ids=str,
 )
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_settings_that_cannot_work_fail_in_the_constructor(algorithm, settings, message):
+def test_invalid_settings_are_refused_in_the_constructor(algorithm, settings, message):
     with pytest.raises(ValueError, match=message):
         build(algorithm, **settings)
 
 
-def test_unknown_arguments_of_the_predictor_are_named():
+def test_unknown_predictor_kwargs_are_refused():
     with pytest.raises(TypeError, match=r"^`predictor_kwargs` holds 'layers', but .* takes net_arch, activation_fn"):
         build(DDPGAP, predictor_kwargs={"layers": [64]})
 
 
-def test_the_smallest_settings_that_can_work():
+def test_smallest_valid_settings_train():
     build(
         DDPGAP, alpha=0, alpha_low=1, t_k=0, n_candidates=1, min_per_class=1, dataset_size=2, validation_size=2
     ).learn(60)
@@ -87,7 +87,7 @@ def test_t_k_beyond_the_warm_up_without_noise_warns(algorithm):
         build(algorithm, t_k=11)
 
 
-def test_an_end_of_guidance_before_its_beginning_warns():
+def test_guidance_end_before_the_first_guided_step_warns():
     with pytest.warns(UserWarning, match="^`guidance_end` = 10 leaves no step to guidance, which begins after 10"):
         build(DDPGAP, guidance_end=10)
 
@@ -96,19 +96,19 @@ def test_an_end_of_guidance_before_its_beginning_warns():
 @pytest.mark.parametrize(
     "settings", [{"guidance_end": 11}, {"t_k": 10}, {"t_k": 11, "action_noise": {"type": "normal", "sigma": 0.1}}]
 )
-def test_no_warning_where_the_policy_explores(settings):
+def test_settings_under_which_the_policy_explores_do_not_warn(settings):
     build(DDPGAP, **settings)
     build(SACAP, t_k=11)
 
 
-def test_unknown_arguments_are_refused():
+def test_unknown_constructor_arguments_are_refused():
     with pytest.raises(TypeError, match="alhpa"):
         build(DDPGAP, alhpa=0.5)
 
 
 @pytest.mark.parametrize("base", [stable_baselines3.PPO, stable_baselines3.A2C, sb3_contrib.TRPO])
 @pytest.mark.parametrize("mixin", [ActionPermissibilityMixin, ConstrainedExplorationMixin])
-def test_a_mixin_before_an_on_policy_algorithm(mixin, base):
+def test_mixin_before_an_on_policy_algorithm_is_refused(mixin, base):
     with pytest.raises(TypeError, match=f"^Mine puts {mixin.__name__} before an on-policy algorithm"):
         type("Mine", (mixin, base), {})
 
@@ -133,6 +133,6 @@ def test_a_mixin_before_an_on_policy_algorithm(mixin, base):
         ),
     ],
 )
-def test_settings_of_sb3_that_cannot_work(settings, message):
+def test_invalid_settings_of_sb3_are_refused(settings, message):
     with pytest.raises(ValueError, match=f"(?s){message}"):
         build(SACAP, **settings)

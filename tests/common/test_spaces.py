@@ -1,3 +1,5 @@
+"""Action and observation spaces that an algorithm cannot use are refused in one sentence."""
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from sb3_sap.common.spaces import check_action_space
 F32 = np.finfo(np.float32)
 
 
-class RuledDQN(ConstrainedExplorationMixin, stable_baselines3.DQN):
+class ConstrainedDQN(ConstrainedExplorationMixin, stable_baselines3.DQN):
     pass
 
 
@@ -38,7 +40,7 @@ def test_action_space_must_be_continuous(algorithm, space):
         build(algorithm, with_actions(space))
 
 
-def test_an_environment_by_name_is_checked_too():
+def test_environment_given_by_name_is_checked():
     with pytest.raises(ValueError, match=r"^DDPGAP needs an `env` with a continuous .*but this one's is Discrete"):
         DDPGAP("MlpPolicy", "CartPole-v1")
 
@@ -50,7 +52,7 @@ def test_action_space_must_be_bounded(algorithm, low):
         build(algorithm, with_actions(spaces.Box(low, np.inf, (1,))))
 
 
-def test_an_environment_that_does_not_exist():
+def test_unknown_environment_raises_the_error_of_gymnasium():
     with pytest.raises(gym.error.Error, match="NoSuchEnvironment"):
         DDPGAP("MlpPolicy", "NoSuchEnvironment-v0")
 
@@ -74,7 +76,7 @@ def test_an_environment_that_does_not_exist():
     ],
     ids=str,
 )
-def test_action_spaces_that_cannot_be_scaled(space, message):
+def test_action_spaces_that_cannot_be_scaled_are_refused(space, message):
     if message is None:
         check_action_space("DDPGAP", space, discrete=False)
         return
@@ -105,13 +107,13 @@ def with_observations(space):
     ],
     ids=str,
 )
-@pytest.mark.parametrize("algorithm", [DQNAP, RuledDQN])
-def test_spaces_that_discrete_actions_and_sb3_cannot_use(algorithm, env, message):
+@pytest.mark.parametrize("algorithm", [DQNAP, ConstrainedDQN])
+def test_spaces_that_discrete_algorithms_cannot_use_are_refused(algorithm, env, message):
     with pytest.raises(ValueError, match=f"^{algorithm.__name__} needs .*{message}"):
         build(algorithm, env)
 
 
-def test_the_shift_that_the_sentence_names_works():
+def test_shift_of_discrete_actions_named_in_the_error_works():
     env = with_actions(spaces.Discrete(3, start=-1))
     env.step = lambda a: executed.append(int(a)) or (np.zeros(2, np.float32), 0.0, False, False, {"permissible": a > 0})
     executed = []

@@ -1,4 +1,4 @@
-"""What functions see behind SB3's wrappers: raw values, true last observations, the environment's own layout."""
+"""Behind SB3's wrappers, the user's functions get raw values and the true last observations of episodes."""
 
 import gymnasium as gym
 import numpy as np
@@ -47,7 +47,7 @@ def went_up(obs, actions, next_obs):
     return (after.astype(float) - before.astype(float))[:, 0] > 0
 
 
-def stood_still(obs, actions, next_obs):
+def is_constant(obs, actions, next_obs):
     return (next_obs["still"] == obs["still"])[:, 0]
 
 
@@ -56,7 +56,7 @@ def vec(n=1, kind=DummyVecEnv, **settings):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64, np.float32, np.float64, np.float16])
-def test_last_observations_under_vec_normalize_are_the_environments_own(dtype):
+def test_last_observations_under_vec_normalize_are_those_of_the_environment(dtype):
     top = 255 if dtype == np.uint8 else 1000
     seen = []
 
@@ -74,30 +74,30 @@ def test_last_observations_under_vec_normalize_are_the_environments_own(dtype):
 
 
 @pytest.mark.parametrize("settings", [{}, {"norm_obs_keys": ["n"]}, {"norm_obs": False}], ids=str)
-def test_entries_of_a_dict_that_stand_still_do_so_at_the_end_of_an_episode(settings):
+def test_constant_dict_entries_are_constant_at_the_end_of_an_episode(settings):
     env = VecNormalize(vec(keyed=True), **settings)
-    model = build(DDPGAP, env, policy="MultiInputPolicy", ap_function=stood_still, learning_starts=1000).learn(70)
+    model = build(DDPGAP, env, policy="MultiInputPolicy", ap_function=is_constant, learning_starts=1000).learn(70)
     assert model.replay_buffer.knowledge.seen == [0, 70]
     buffer = model.replay_buffer
     np.testing.assert_array_equal(buffer.next_observations["still"][:70], buffer.observations["still"][:70])
 
 
 @pytest.mark.slow
-def test_last_observations_come_from_subprocesses_too():
+def test_last_observations_of_subprocesses_are_raw():
     env = VecNormalize(vec(2, SubprocVecEnv, dtype=np.int64))
     model = build(DDPGAP, env, ap_function=went_up, learning_starts=1000).learn(140)
     env.close()
     assert model.replay_buffer.knowledge.seen == [0, 140]
 
 
-def test_n_step_returns_get_the_last_observation_too():
+def test_n_step_buffer_stores_raw_last_observations():
     env = VecNormalize(vec(dtype=np.int64))
     model = build(DDPGAP, env, n_steps=3, ap_function=went_up, learning_starts=1000).learn(70)
     buffer = model.replay_buffer
     assert set((buffer.next_observations - buffer.observations)[:70].ravel()) == {1}
 
 
-def test_beyond_the_clip_of_vec_normalize_labels_are_right():
+def test_labels_are_right_beyond_the_clip_of_vec_normalize():
     class Leap(Count):
         def observe(self):
             return super().observe() + np.float32(10_000 * (self.t == 7))
@@ -107,22 +107,22 @@ def test_beyond_the_clip_of_vec_normalize_labels_are_right():
     assert model.replay_buffer.knowledge.seen == [10, 60]
 
 
-def test_the_environment_is_left_as_it_was():
+def test_learning_leaves_the_methods_of_the_environment_as_they_were():
     env = vec()
-    own = env.step_wait = env.step_wait  # somebody else's
+    own = env.step_wait = env.step_wait  # as another library may have set it
     build(DDPGAP, VecNormalize(env), ap_function=went_up).learn(20)
     assert vars(env)["step_wait"] is own
     assert "reset" not in vars(env)
 
 
-def test_eval_callback_with_vec_normalize_goes_on_working():
+def test_eval_callback_synchronises_vec_normalize_as_before():
     train, evaluation = VecNormalize(vec()), VecNormalize(vec(), training=False)
     callback = EvalCallback(evaluation, eval_freq=20, n_eval_episodes=1, verbose=0, warn=False)
     build(DDPGAP, train, ap_function=went_up).learn(41, callback=callback)
     assert evaluation.obs_rms.count == pytest.approx(41, abs=2)
 
 
-# ---------------------------------------------------------------- wrappers that cannot work
+# ---------------------------------------------------------------- orders of wrappers, and evaluations in between
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_eval_callback_with_vec_normalize_goes_on_working():
         (lambda env: VecNormalize(VecNormalize(env)), "^`env` is wrapped in VecNormalize twice"),
     ],
 )
-def test_wrappers_in_an_order_that_mixes_raw_and_normalised(wrap, message):
+def test_wrapper_orders_that_mix_raw_and_normalised_observations_are_refused(wrap, message):
     with pytest.raises(ValueError, match=message):
         build(DDPGAP, wrap(DummyVecEnv([Line])))
     build(DDPGAP, VecNormalize(VecFrameStack(DummyVecEnv([Line]), 2))).learn(30)
@@ -140,11 +140,13 @@ def test_wrappers_in_an_order_that_mixes_raw_and_normalised(wrap, message):
 
 @pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize], ids=["plain", "VecNormalize"])
 @pytest.mark.parametrize("keyed", [False, True])
-def test_learning_goes_on_right_after_an_evaluation_in_the_same_environment(wrap, keyed):
+def test_learning_continues_correctly_after_an_evaluation_in_the_same_environment(wrap, keyed):
     policy = "MultiInputPolicy" if keyed else "MlpPolicy"
     model = build(DDPGAP, wrap(vec(2, keyed=keyed)), policy=policy, ap_function=went_up).learn(12)
     model.learn(12, reset_num_timesteps=False)
-    assert model._episode_num == 2  # of seven steps: nobody was there, so nothing was reset
+    assert (
+        model._episode_num == 2
+    )  # of seven steps each: the environment was not used in between, and therefore not reset
     evaluate_policy(model, model.get_env(), 1, warn=False)
     model.learn(40, reset_num_timesteps=False)
     assert model.replay_buffer.knowledge.seen == [0, 64]

@@ -1,3 +1,5 @@
+"""Warnings of a training environment that is also used elsewhere, or that does not normalise as before."""
+
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -8,6 +10,8 @@ from sb3_sap import DDPGAP
 
 
 class Evaluates(BaseCallback):
+    """Evaluates once in the training environment."""
+
     def _on_step(self):
         if self.n_calls == 20:
             evaluate_policy(self.model, self.training_env, 1, warn=False)
@@ -23,7 +27,7 @@ class Evaluates(BaseCallback):
         lambda env: EvalCallback(env.envs[0], eval_freq=20, verbose=0, warn=False),
         lambda env: Evaluates(),
     ],
-    ids=["EvalCallback", "nested", "the environment inside", "by itself"],
+    ids=["EvalCallback", "nested", "the environment inside", "own callback"],
 )
 def test_evaluating_in_the_training_environment_warns(make):
     env = DummyVecEnv([Line])
@@ -36,11 +40,11 @@ def test_evaluating_in_another_environment_does_not_warn():
     env = DummyVecEnv([Line] * 2)
     callback = EvalCallback(DummyVecEnv([Line]), eval_freq=10, verbose=0, warn=False)
     model = build(DDPGAP, env).learn(40, callback=callback)
-    model.learn(7, callback=lambda *_: False)  # stopped amid a step
+    model.learn(7, callback=lambda *_: False)  # stopped within a rollout
 
 
 class Skips(VecEnvWrapper):
-    """Every action is executed twice."""
+    """Executes every action twice."""
 
     def reset(self):
         return self.venv.reset()
@@ -54,7 +58,7 @@ class Skips(VecEnvWrapper):
 
 @pytest.mark.filterwarnings("error:The training environment")
 @pytest.mark.parametrize("wrap", [Skips, lambda env: VecNormalize(Skips(env))])
-def test_a_wrapper_that_steps_twice_is_nobody_else(wrap):
+def test_wrapper_that_steps_twice_does_not_warn(wrap):
     build(DDPGAP, wrap(DummyVecEnv([Line]))).learn(40)
 
 

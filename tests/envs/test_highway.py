@@ -1,4 +1,4 @@
-"""The embedded simulator: against hand-computed motion, highway-env's own geometry, and a whole lap."""
+"""The embedded simulator, compared with motion computed by hand and with highway-env's geometry, and whole laps."""
 
 import math
 import subprocess
@@ -28,7 +28,7 @@ WHEELBASE = 5.0
 
 
 def linear_feedback(obs: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Steer against the angle, the offset and (undoing side slip) with the lateral speed: what any agent must beat."""
+    """Steer against the angle, the offset and (undoing side slip) with the lateral speed."""
     angle, track_pos, _, speed_y, _ = obs
     return np.array([np.clip(2.5 / STEERING_LOCK * angle - 1.6 * track_pos + speed_y, -1, 1)], dtype=np.float32)
 
@@ -74,7 +74,7 @@ def test_steady_circle_turns_at_the_neutral_steer_rate() -> None:
     for _ in range(20):
         before = simulator.step(delta / STEERING_LOCK).angle
     after = simulator.step(delta / STEERING_LOCK).angle
-    # Axles alike and equally far from the middle: the car follows its wheels, at V·δ/L whatever the tyres' stiffness.
+    # With equal axles equally far from the middle, the car turns at V·δ/L, whatever the stiffness of the tyres.
     assert (before - after) % (2 * math.pi) / 0.2 == pytest.approx(50 / 3.6 * delta / WHEELBASE, rel=0.01)
 
 
@@ -91,7 +91,7 @@ def test_sub_steps_are_small_enough(monkeypatch: pytest.MonkeyPatch, speed: floa
 
 
 @pytest.mark.parametrize("track", ["wheel-2", "g-track-3"])
-def test_lanes_are_the_tracks_pieces(track: str) -> None:
+def test_lanes_follow_the_pieces_of_the_track(track: str) -> None:
     plan = get_track(track)
     lanes = road_network(plan).lanes_list()
     assert len(lanes) == len(plan.pieces)
@@ -103,7 +103,7 @@ def test_lanes_are_the_tracks_pieces(track: str) -> None:
             assert math.cos(lane.heading_at(along) - heading) == pytest.approx(1)
 
 
-def test_the_car_is_where_its_highway_env_lane_says() -> None:
+def test_car_state_agrees_with_the_lane_coordinates_of_highway_env() -> None:
     simulator = HighwaySimulator("wheel-2")
     state = simulator.reset(1000, 0.1, 0)
     for _ in range(300):
@@ -159,7 +159,7 @@ def test_environment_passes_both_checkers(options: dict[str, object]) -> None:
     assert env.spec.max_episode_steps == 10_000
 
 
-def test_same_seed_same_bits() -> None:
+def test_same_seed_gives_the_same_bits() -> None:
     def episode(seed: int) -> NDArray[np.float32]:
         env = gym.make("sap/LaneKeeping-v0", random_start=True)
         obs = [env.reset(seed=seed)[0]]
@@ -170,7 +170,7 @@ def test_same_seed_same_bits() -> None:
     assert episode(1).tobytes() != episode(2).tobytes()
 
 
-def test_every_lap_drives_the_same_from_the_same_start() -> None:
+def test_same_start_and_actions_give_the_same_states() -> None:
     simulator = HighwaySimulator("eroad")
     runs = []
     for _ in range(2):
@@ -179,10 +179,10 @@ def test_every_lap_drives_the_same_from_the_same_start() -> None:
     assert runs[0] == runs[1]
 
 
-def test_subprocesses_drive_as_this_one_does() -> None:
+def test_environments_in_subprocesses_give_the_same_observations() -> None:
     single, workers = (
         make_vec_env(
-            "sb3_sap:sap/LaneKeeping-v0",  # a worker imports what stands before the colon
+            "sb3_sap:sap/LaneKeeping-v0",  # a worker imports the module before the colon
             n_envs=2,
             seed=1,
             env_kwargs={"random_start": True},
@@ -204,18 +204,18 @@ def test_importing_the_environments_loads_no_simulator() -> None:
 
 
 @pytest.mark.parametrize("speed", [0, 4.9, 145, math.nan])
-def test_bad_speed_is_told_in_a_sentence(speed: float) -> None:
+def test_invalid_speed_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match=r"speed must lie in \[5, 144\] km/h, got"):
         HighwaySimulator(speed=speed)
 
 
 @pytest.mark.parametrize("control_step", [0, -0.2, math.inf])
-def test_bad_control_step_is_told_in_a_sentence(control_step: float) -> None:
+def test_invalid_control_step_is_refused(control_step: float) -> None:
     with pytest.raises(ValueError, match="control_step must be a positive number of seconds, got"):
         HighwaySimulator(control_step=control_step)
 
 
-def test_unknown_track_reaches_the_user_of_gym_make() -> None:
+def test_unknown_track_is_refused_by_gym_make() -> None:
     with pytest.raises(ValueError, match="did you mean 'spring'"):
         gym.make("sap/LaneKeeping-v0", track="sprint")
 

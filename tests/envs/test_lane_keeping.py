@@ -1,4 +1,4 @@
-"""The task, on a simulator whose states are written down beforehand."""
+"""The lane-keeping task, on a simulator with given states."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from sb3_sap.envs.lane_keeping import OBSERVATION_SCALE, reward
 
 
 class ScriptedSimulator:
-    """A lap of 100 m; each step returns the next of the states given."""
+    """A lap of 100 m; each step returns the next of the given states."""
 
     def __init__(self, *states: CarState, control_step: float = 0.2) -> None:
         self.track: Track = get_track("wheel-2")
@@ -64,7 +64,7 @@ def started(*states: CarState, options: dict[str, Any] | None = None, **kwargs: 
     [
         (car(), 50.0),
         (car(track_pos=0.5), 25.0),
-        (car(track_pos=-0.5), 25.0),  # both edges alike
+        (car(track_pos=-0.5), 25.0),  # the other edge
         (car(angle=math.pi / 6), 50 * (math.sqrt(3) / 2 - 0.5)),
         (car(angle=-math.pi / 6), 50 * (math.sqrt(3) / 2 - 0.5)),
         (car(speed_x=-10.0), -10.0),
@@ -82,13 +82,13 @@ def test_observation_is_table_1_in_documented_units() -> None:
     assert obs.dtype == np.float32
 
 
-def test_observation_never_leaves_its_space() -> None:
+def test_observation_is_clipped_to_its_space() -> None:
     env = started(CarState(-math.pi, 9.0, 1e6, -1e6, 1e6, 0.0))
     obs, *_ = drive(env)
     assert env.observation_space.contains(obs)
 
 
-def test_info_is_raw() -> None:
+def test_info_holds_raw_values() -> None:
     env = LaneKeepingEnv(ScriptedSimulator(CarState(0.1, -0.5, 50.0, -5.0, 2.5, 25.0)))
     _, info = env.reset()
     assert "permissible" not in info
@@ -113,7 +113,7 @@ def test_permissible_is_eq_6(before: float, after: float, permissible: bool) -> 
 def test_ap_function_takes_a_batch() -> None:
     obs, next_obs = np.zeros((3, 5)), np.zeros((3, 5))
     obs[:, 1], next_obs[:, 1] = [0.5, 0.5, 0.0], [0.4, 0.6, 0.0]
-    next_obs[:, 0] = 1.0  # the angle plays no part
+    next_obs[:, 0] = 1.0  # the angle has no influence
     labels = ap_function(obs, np.zeros((3, 1)), next_obs)
     assert labels.tolist() == [True, False, True]
     assert labels.dtype == np.bool_
@@ -128,7 +128,7 @@ def test_leaving_the_road_or_facing_backwards_ends_the_episode(state: CarState, 
     assert (reward, terminated, truncated, info["off_track"]) == (-200.0, True, False, off_track)
 
 
-def test_what_losing_the_road_costs_can_be_chosen() -> None:
+def test_off_track_reward_can_be_set() -> None:
     assert drive(started(car(track_pos=1.1), off_track_reward=-7.5))[1] == -7.5
     assert drive(started(car(track_pos=0.5), off_track_reward=-7.5))[1] == 25.0
     with pytest.raises(ValueError, match="off_track_reward must be a number, got inf"):
@@ -147,7 +147,7 @@ def test_standing_still_ends_the_episode_after_grace_and_five_seconds() -> None:
     assert (reward, terminated, truncated) == (0.5, True, False)
 
 
-def test_moving_again_starts_the_five_seconds_anew() -> None:
+def test_moving_again_restarts_the_five_seconds() -> None:
     env = started(*[car(speed_x=0.0)] * 39, car(speed_x=-2.0), *[car(speed_x=0.0)] * 25)
     assert not drive(env, 64)[2]
     assert drive(env)[2]
@@ -170,7 +170,7 @@ def test_rolling_back_over_the_line_covers_nothing() -> None:
     assert (truncated, info["covered"], info["lap_done"]) == (False, 0.0, False)
 
 
-def test_two_laps_and_no_end() -> None:
+def test_episode_ends_after_the_given_laps_or_never() -> None:
     once_around = [car(distance=d) for d in (40.0, 80.0, 10.0)]
     info = drive(env := started(*once_around, *once_around, laps=2), 3)[4]
     assert (info["covered"], info["lap_done"]) == (pytest.approx(0.55), False)
@@ -223,18 +223,18 @@ def test_random_starts_follow_the_seed() -> None:
         ({"distance": "far"}, "got 'far'"),
     ],
 )
-def test_bad_starts_are_told_in_a_sentence(options: dict[str, Any], message: str) -> None:
+def test_invalid_starts_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         LaneKeepingEnv(ScriptedSimulator()).reset(options=options)
 
 
 @pytest.mark.parametrize("laps", [0, -1, 1.5, True])
-def test_bad_laps_are_told_in_a_sentence(laps: Any) -> None:
+def test_invalid_laps_are_refused(laps: Any) -> None:
     with pytest.raises(ValueError, match="laps must be a positive whole number, or None"):
         LaneKeepingEnv(ScriptedSimulator(), laps=laps)
 
 
-def test_bad_render_mode_is_told_in_a_sentence() -> None:
+def test_invalid_render_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="render_mode must be None, 'human' or 'rgb_array', got 'ansi'"):
         LaneKeepingEnv(ScriptedSimulator(), render_mode="ansi")
 
@@ -250,7 +250,7 @@ def test_score_of_a_perfect_lap_is_one() -> None:
     assert score(36 * 50.0, 100.0, 0.2) == pytest.approx(1.0)
 
 
-def _interval(constraint: Any, before: float, now: float, last: float) -> tuple[float, float]:
+def interval(constraint: Any, before: float, now: float, last: float) -> tuple[float, float]:
     obs, previous_obs = np.zeros(5, np.float32), np.zeros(5, np.float32)
     obs[1], previous_obs[1] = now, before
     low, high = constraint(obs, previous_obs, np.array([last], np.float32))
@@ -269,6 +269,8 @@ def _interval(constraint: Any, before: float, now: float, last: float) -> tuple[
         (0.3, 0.0, (-1, 1), (-1, 1)),  # on the axis
     ],
 )
-def test_constraints(before: float, now: float, ce1: Sequence[float], ce2: Sequence[float]) -> None:
-    assert _interval(constraint_ce1, before, now, 0.5) == ce1
-    assert _interval(constraint_ce2, before, now, 0.5) == ce2
+def test_constraints_ce1_and_ce2_forbid_steering_further_from_the_axis(
+    before: float, now: float, ce1: Sequence[float], ce2: Sequence[float]
+) -> None:
+    assert interval(constraint_ce1, before, now, 0.5) == ce1
+    assert interval(constraint_ce2, before, now, 0.5) == ce2

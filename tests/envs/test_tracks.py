@@ -1,4 +1,4 @@
-"""Tracks: geometry that a drawing on paper predicts, the paper's five, generated ones, and files."""
+"""Tracks: geometry as in a drawing on paper, the shipped and the generated ones, and their files."""
 
 import math
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_locate_inverts_position_from_any_piece_nearby(distance: float, offset: 
     track = get_track("wheel-2")
     x, y, heading = track.position(distance, offset)
     found, lateral, found_heading, piece = track.locate(x, y, track.piece_at(distance + moved))
-    # Across the start line the plan has a gap of 0.26 m, and one point two addresses.
+    # At the start line the plan has a gap of 0.26 m, and some points have two addresses.
     tolerance = 0.3 if min(found, track.length - found) < 7 else 1e-6
     assert (found - distance + 1000) % track.length - 1000 == pytest.approx(0, abs=tolerance)
     assert lateral == pytest.approx(offset, abs=tolerance)
@@ -66,7 +66,7 @@ def test_locate_inverts_position_from_any_piece_nearby(distance: float, offset: 
     assert track.pieces[piece].start <= found + tolerance
 
 
-def test_following_beats_the_nearest_piece_where_wheel_2_crosses_itself() -> None:
+def test_locate_follows_the_given_piece_where_wheel_2_crosses_itself() -> None:
     track = get_track("wheel-2")
     places = np.arange(0, track.length, 5.0)
     plan = np.array([track.position(s)[:2] for s in places])
@@ -113,7 +113,7 @@ def test_generated_tracks_differ_by_seed() -> None:
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "1"])
-def test_generating_needs_a_seed(seed: object) -> None:
+def test_invalid_seed_of_a_generated_track_is_refused(seed: object) -> None:
     with pytest.raises(ValueError, match="seed of a generated track must be a non-negative integer"):
         generate_track(seed)  # type: ignore[arg-type]
 
@@ -157,11 +157,11 @@ XML = """<?xml version="1.0" encoding="UTF-8"?>
 
 def _write(folder: Path, text: str) -> Path:
     path = folder / "course.xml"
-    path.write_bytes(text.encode("latin-1"))  # as TORCS' files are, whatever they claim
+    path.write_bytes(text.encode("latin-1"))  # as the files of TORCS are, whatever they declare
     return path
 
 
-def test_torcs_xml_is_read(tmp_path: Path) -> None:
+def test_torcs_xml_is_read_into_segments(tmp_path: Path) -> None:
     track = get_track(_write(tmp_path, XML))
     assert (track.name, track.width) == ("course", 12)
     assert track.segments == (
@@ -188,7 +188,7 @@ def test_torcs_xml_is_read(tmp_path: Path) -> None:
         (XML.replace('name="width"', 'name="wide"'), "width of track 'course' must be a positive number"),
     ],
 )
-def test_damaged_xml_is_told_in_a_sentence(tmp_path: Path, text: str, message: str) -> None:
+def test_damaged_xml_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         read_track_xml(_write(tmp_path, text))
 
@@ -205,7 +205,7 @@ HEAD = "# width_m: 12\ntype,length_m,radius_m,end_radius_m,turn_deg,steps\n"
         (HEAD, "at least one segment, got none"),
     ],
 )
-def test_damaged_table_is_told_in_a_sentence(tmp_path: Path, text: str, message: str) -> None:
+def test_damaged_table_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "course.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):

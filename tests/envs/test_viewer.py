@@ -1,4 +1,4 @@
-"""Pictures: what is where, judged by the colours of single pixels."""
+"""Pictures of the car on its road, checked by the colours of single pixels."""
 
 import gymnasium as gym
 import numpy as np
@@ -28,12 +28,12 @@ def straight_road() -> Viewer:
 
 
 def eastward(track_pos: float = 0.0, angle: float = 0.0, steering: float = 0.0) -> NDArray[np.uint8]:
-    """A car amid that straight."""
+    """A car in the middle of that straight."""
     return straight_road().draw(CarState(angle, track_pos, 50, 0, 0, 500.0), steering)
 
 
 def at(picture: NDArray[np.uint8], right: float = 0.0, up: float = 0.0) -> tuple[int, ...]:
-    """Colour of the pixel so many metres from the middle."""
+    """Colour of the pixel that many metres from the middle."""
     return tuple(picture[round(MIDDLE[0] - up * SCALING), round(MIDDLE[1] + right * SCALING)].tolist())
 
 
@@ -46,19 +46,19 @@ def test_car_road_and_grass_are_in_their_places() -> None:
     assert [at(picture, up=up) for up in (7, -7)] == [GRASS, GRASS]
 
 
-def test_a_car_at_the_left_edge_has_the_road_below_it() -> None:
-    picture = eastward(track_pos=1.0)  # the car stays in the middle of the picture; driving east, left is up
+def test_car_at_the_left_edge_has_the_road_below_it() -> None:
+    picture = eastward(track_pos=1.0)  # the car remains in the middle of the picture; driving east, left is up
     assert at(picture) == CAR
     assert at(picture, up=2) == GRASS
     assert at(picture, up=-11) == ASPHALT
 
 
-def test_a_car_that_points_right_is_drawn_so() -> None:
+def test_car_that_points_right_of_east_is_drawn_pointing_down() -> None:
     picture = eastward(angle=0.8)  # to the right of east is down
     assert [at(picture, right=1.2, up=up) for up in (-1.2, 1.2)] == [CAR, ASPHALT]
 
 
-def test_small_headings_are_drawn_too() -> None:
+def test_small_headings_are_drawn() -> None:
     assert not np.array_equal(eastward(angle=0.03), eastward())
 
 
@@ -69,26 +69,26 @@ def test_steering_moves_the_bar_to_its_side() -> None:
 
 def test_only_the_road_nearby_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     viewer = Viewer(get_track("spring"))
-    asked: list[float] = []
+    drawn: list[float] = []
     position = Track.position
 
     def spy(track: Track, distance: float, lateral: float = 0.0) -> tuple[float, float, float]:
-        asked.append(distance % track.length)
+        drawn.append(distance % track.length)
         return position(track, distance, lateral)
 
     monkeypatch.setattr(Track, "position", spy)
     viewer.draw(CarState(0, 0, 50, 0, 0, 11_000.0), 0.0)
-    assert len(asked) < 500
-    assert 10_900 < min(asked) < max(asked) < 11_100
+    assert len(drawn) < 500
+    assert 10_900 < min(drawn) < max(drawn) < 11_100
 
 
 @pytest.mark.parametrize("distance", [0.0, 6205.0])
-def test_the_road_goes_on_across_the_start_line(distance: float) -> None:
+def test_road_continues_across_the_start_line(distance: float) -> None:
     picture = Viewer(get_track("wheel-2")).draw(CarState(0, 0, 50, 0, 0, distance), 0.0)
     assert [at(picture, right=right, up=3) for right in (-25, 25)] == [ASPHALT, ASPHALT]
 
 
-def test_environment_renders_what_it_drives() -> None:
+def test_environment_renders_another_picture_after_a_step() -> None:
     env = gym.make("sap/LaneKeeping-v0", render_mode="rgb_array")
     env.reset()
     first = env.render()
@@ -103,7 +103,7 @@ def test_environment_renders_what_it_drives() -> None:
 
 @pytest.fixture
 def windows(monkeypatch: pytest.MonkeyPatch) -> list[pygame.Window]:
-    """Every window that is opened, on a screen that is none."""
+    """Every window that is opened, on a dummy screen."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     opened: list[pygame.Window] = []
     window = pygame.Window
@@ -111,7 +111,7 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[pygame.Window]:
     return opened
 
 
-def test_a_window_opens_and_closes(windows: list[pygame.Window]) -> None:
+def test_window_opens_and_closes(windows: list[pygame.Window]) -> None:
     env = gym.make("sap/LaneKeeping-v0", render_mode="human")
     env.reset()
     env.step(np.zeros(1, dtype=np.float32))
@@ -137,7 +137,7 @@ def test_two_windows_do_not_draw_into_each_other(windows: list[pygame.Window]) -
 
 @pytest.mark.parametrize("mode", ["rgb_array", "human"])
 @pytest.mark.parametrize("another", ["CartPole-v1", "parking-v0"])
-def test_another_environment_that_quits_pygame_takes_nothing_away(
+def test_rendering_continues_after_another_environment_quits_pygame(
     windows: list[pygame.Window], mode: str, another: str
 ) -> None:
     ours, other = gym.make("sap/LaneKeeping-v0", render_mode=mode), make_env(another, render_mode="rgb_array")
@@ -148,7 +148,7 @@ def test_another_environment_that_quits_pygame_takes_nothing_away(
     other.close()
     pygame.quit()  # whether or not the other one did
     np.testing.assert_array_equal(before, ours.render())
-    pygame.init()  # a font from before the quit stays dead
+    pygame.init()  # a font from before cannot be used any more
     np.testing.assert_array_equal(before, ours.render())
     assert len(windows) == (2 if mode == "human" else 0)
     ours.close()
@@ -178,7 +178,7 @@ def test_fan_is_green_where_steering_is_permissible_and_red_elsewhere() -> None:
     (row, column), ahead = MIDDLE, 95  # 95 pixels are 10.6 m
     assert red_or_green(picture[row - 25, column + ahead]) == "green"
     assert red_or_green(picture[row + 25, column + ahead]) == "red"
-    assert tuple(picture[row, column + ahead]) == LINE  # straight ahead is what it will do
+    assert tuple(picture[row, column + ahead]) == LINE  # the action is to steer straight ahead
 
 
 def test_fan_leaves_no_trace_in_the_next_picture_without_one() -> None:

@@ -1,4 +1,4 @@
-"""Laps driven with a policy alone, and what the demo shows of them."""
+"""Laps that are driven with a policy alone, and the files that are read and written for them."""
 
 import json
 
@@ -26,7 +26,7 @@ class Feedback:
         return np.clip(np.array([steering], dtype=np.float32), -1, 1), None
 
 
-def test_lap_of_a_good_driver():
+def test_lap_of_linear_feedback_is_done_with_a_high_score():
     result = drive_lap(Feedback(), "g-track-3")
     length = get_track("g-track-3").length
     assert result.lap_done
@@ -37,13 +37,13 @@ def test_lap_of_a_good_driver():
     assert result.steps == pytest.approx(length / (50 / 3.6 * 0.2), rel=0.02)
 
 
-def test_lap_of_a_lost_driver():
+def test_lap_with_full_steering_is_not_done():
     result = drive_lap(Feedback(lost=True), "g-track-3")
     assert not result.lap_done
     assert result.covered < 0.05
 
 
-def test_results_are_a_list_of_rows(tmp_path):
+def test_results_are_written_as_a_list_of_rows(tmp_path):
     results = [LapResult("eroad", True, 1.0, 50_000.0, 0.85, 1174)]
     write_results(tmp_path / "deep" / "evaluation.json", results)
     [row] = json.loads((tmp_path / "deep" / "evaluation.json").read_text())
@@ -58,7 +58,7 @@ def test_results_are_a_list_of_rows(tmp_path):
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["evaluation.json"]
 
 
-def test_policy_alone_equals_the_model(tmp_path):
+def test_loaded_policy_predicts_like_the_model(tmp_path):
     model = DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0"), seed=0)
     model.save(tmp_path / "model")
     obs = np.random.default_rng(0).normal(size=(5, 5)).astype(np.float32)
@@ -66,7 +66,7 @@ def test_policy_alone_equals_the_model(tmp_path):
     assert np.array_equal(policy.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
 
-def test_truncated_and_missing_model_files(tmp_path):
+def test_truncated_and_missing_model_files_are_refused(tmp_path):
     model = DDPGAP("MlpPolicy", gym.make("sap/LaneKeeping-v0"))
     model.save(tmp_path / "model.zip")
     whole = (tmp_path / "model.zip").read_bytes()
@@ -78,13 +78,13 @@ def test_truncated_and_missing_model_files(tmp_path):
         load_policy(tmp_path / "none.zip")
 
 
-def test_papers_totals_give_the_scores_that_are_quoted():
+def test_total_rewards_of_the_paper_give_the_quoted_scores():
     cells = TABLE_2[15_000]["ddpg_ap"]
     scores = [round(paper_score(track, cells[track].total_reward), 3) for track in TEST_TRACKS]
     assert scores == [0.940, 0.950, 0.950, 0.967]
 
 
-def test_a_road_may_be_driven_again():
+def test_lap_environment_can_be_driven_several_times():
     env = lap_env("g-track-3")
     first = [lap(Feedback(lost), env, "g-track-3") for lost in (False, True, False)]
     assert first[0] == first[2] == drive_lap(Feedback(), "g-track-3")

@@ -1,4 +1,4 @@
-"""A policy that learned on normalised observations, alone with the statistics that its run left."""
+"""A policy of normalised observations, with the statistics that its run saved."""
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +30,7 @@ def model():
     return build(DDPGAP, normalised()).learn(30)
 
 
-def test_statistics_beside_a_model_are_used_and_never_change(model, tmp_path):
+def test_statistics_beside_a_model_are_used_and_remain_unchanged(model, tmp_path):
     env = model.get_vec_normalize_env()
     model.save(tmp_path / "model.zip")
     env.save(tmp_path / "vecnormalize.pkl")
@@ -42,7 +42,7 @@ def test_statistics_beside_a_model_are_used_and_never_change(model, tmp_path):
     assert np.array_equal(policy.statistics.obs_rms.mean, before)
 
 
-def test_a_model_that_needs_statistics_is_refused_without(model, tmp_path):
+def test_model_of_normalised_observations_is_refused_without_statistics(model, tmp_path):
     model.save(tmp_path / "model.zip")
     with pytest.raises(ValueError, match=r"model.zip learned on normalised .* `--vecnormalize FILE`"):
         load_policy(tmp_path / "model.zip")
@@ -50,7 +50,7 @@ def test_a_model_that_needs_statistics_is_refused_without(model, tmp_path):
     assert load_policy(tmp_path / "model.zip", tmp_path / "elsewhere.pkl").path == tmp_path / "elsewhere.pkl"
 
 
-def test_a_model_of_raw_observations_leaves_what_lies_beside_it(tmp_path):
+def test_model_of_raw_observations_ignores_statistics_beside_it(tmp_path):
     build(DDPGAP).learn(12).save(tmp_path / "model.zip")
     statistics = normalised()
     statistics.save(tmp_path / "vecnormalize.pkl")
@@ -60,7 +60,7 @@ def test_a_model_of_raw_observations_leaves_what_lies_beside_it(tmp_path):
     statistics.norm_obs = False
     statistics.save(tmp_path / "vecnormalize.pkl")
     policy = load_policy(tmp_path / "model.zip", tmp_path / "vecnormalize.pkl")
-    assert np.array_equal(actions(policy), actions(policy.policy))  # rewards alone were normalised
+    assert np.array_equal(actions(policy), actions(policy.policy))  # only rewards were normalised
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_a_model_of_raw_observations_leaves_what_lies_beside_it(tmp_path):
         ("best_model.zip", None),
     ],
 )
-def test_where_statistics_are_found(name, statistics, tmp_path):
+def test_statistics_are_found_beside_the_model_or_in_the_folder_of_its_run(name, statistics, tmp_path):
     for other in ("rl_model_vecnormalize_1000_steps.pkl", "hub/vecnormalize.pkl", "Pendulum-v1/config.yml"):
         (tmp_path / other).parent.mkdir(exist_ok=True)
         (tmp_path / other).touch()
@@ -83,7 +83,7 @@ def test_where_statistics_are_found(name, statistics, tmp_path):
     assert find_statistics(tmp_path / name) == (tmp_path / statistics if statistics else None)
 
 
-def test_of_several_runs_one_has_to_be_named(tmp_path):
+def test_statistics_of_several_runs_must_be_named(tmp_path):
     for run in ("A-v0", "B-v0"):
         (tmp_path / run).mkdir()
         for name in ("config.yml", "vecnormalize.pkl"):
@@ -93,7 +93,7 @@ def test_of_several_runs_one_has_to_be_named(tmp_path):
     assert find_statistics(tmp_path / "A-v0.zip") == tmp_path / "A-v0" / "vecnormalize.pkl"
 
 
-def test_a_plain_model_of_sb3_with_its_checkpoint_callback(tmp_path):
+def test_checkpoint_of_a_plain_sb3_model_gets_its_statistics(tmp_path):
     env = normalised("dict")
     model = DDPG("MultiInputPolicy", env, buffer_size=100, policy_kwargs={"net_arch": [8]}, seed=1)
     model.learn(20, callback=CheckpointCallback(10, tmp_path, save_vecnormalize=True))
@@ -111,7 +111,7 @@ class Wide(Line):
         self.observation_space = spaces.Box(-1, 1, (3,), np.float32)
 
 
-def test_statistics_that_do_not_fit(model, tmp_path):
+def test_statistics_that_do_not_fit_are_refused(model, tmp_path):
     model.save(tmp_path / "model.zip")
 
     def refused(name, sentence, error=ValueError):
@@ -132,7 +132,7 @@ def test_statistics_that_do_not_fit(model, tmp_path):
     refused("dict.pkl", r"shape \{'time': \(1,\), 'x': \(1,\)\}, but the model takes \(2,\)")
 
 
-def test_evaluate_says_which_statistics_it_uses(tmp_path, capsys):
+def test_evaluate_prints_which_statistics_it_uses(tmp_path, capsys):
     def lane():
         return gym.make("sap/LaneKeeping-v0", laps=None)
 

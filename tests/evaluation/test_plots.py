@@ -1,4 +1,4 @@
-"""Pictures, judged by the numbers in them."""
+"""Plots, checked by the numbers in them."""
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ from sb3_sap import DDPGAP, DQNAP
 from sb3_sap.evaluation.predictor_plots import permissible_probability
 from sb3_sap.plots import plot_permissibility, return_curves, save
 
-LINEAR = {"net_arch": []}  # E is one linear layer
+LINEAR = {"net_arch": []}  # the predictor is one linear layer
 
 
 def linear_model(weights, algorithm=DDPGAP, env=None, **kwargs):
-    """A model whose E is the sigmoid of a weighted sum of (observation, action)."""
+    """A model whose predictor is the sigmoid of a weighted sum of (observation, action)."""
     model = build(algorithm, env, predictor_kwargs=LINEAR, **kwargs)
     with th.no_grad():
         model.predictor.head[0].weight.copy_(th.tensor([weights]))
@@ -34,7 +34,7 @@ def mesh(figure):
     return image, axis.lines[0].get_xdata(), axis.lines[0].get_ydata()
 
 
-def test_probability_of_every_state_and_action():
+def test_permissible_probability_is_given_for_every_state_and_action():
     model = linear_model([2.0, 0.0, 3.0], env=Line(low=-20.0, high=60.0))
     obs = np.array([[0.5, 0.0], [-1.0, 0.3]], dtype=np.float32)
     actions = np.array([[-20.0], [20.0], [60.0]])  # scaled: -1, 0, 1
@@ -45,7 +45,7 @@ def test_probability_of_every_state_and_action():
     assert permissible_probability(model, obs, per_state) == pytest.approx(expected, abs=1e-6)
 
 
-def test_region_over_a_variable_and_an_action(tmp_path):
+def test_plot_shows_probabilities_over_a_variable_and_an_action(tmp_path):
     model = linear_model([2.0, 1.0, 3.0])
     figure = plot_permissibility(model, 0, obs=np.array([9.0, 0.5], np.float32), limits=(-2, 2), variable_name="x [m]")
     image, values, actor = mesh(figure)
@@ -60,7 +60,7 @@ def test_region_over_a_variable_and_an_action(tmp_path):
     assert (tmp_path / "region.png").stat().st_size > 5_000
 
 
-def test_the_other_actions_are_the_actors():
+def test_other_action_dimensions_are_those_of_the_actor():
     model = linear_model([0.0, 0.0, 0.0, 3.0], env=Line(dim=2))
     image, values, _ = mesh(plot_permissibility(model, action=0, limits=(-1, 1), obs=np.zeros(2, np.float32)))
     states = np.column_stack([values, np.zeros(len(values))]).astype(np.float32)
@@ -68,7 +68,7 @@ def test_the_other_actions_are_the_actors():
     assert image == pytest.approx(np.tile(sigmoid(3 * second), (len(image), 1)), abs=1e-6)
 
 
-def test_a_key_of_a_dictionary():
+def test_variable_of_a_dict_observation_is_given_by_its_key():
     model = linear_model([1.0, 2.0, 0.0], env=Line("dict"), policy="MultiInputPolicy")  # keys: time, x, action
     held = {"x": np.zeros(1, np.float32), "time": np.full(1, 3.0, np.float32)}
     figure = plot_permissibility(model, ("x", 0), obs=held, limits=(-1, 1))
@@ -85,7 +85,7 @@ def test_axes_are_named_as_in_code():
     assert plot_permissibility(goal, ("observation", 1)).axes[0].get_xlabel() == "observation[1]"
 
 
-def test_discrete_actions():
+def test_discrete_actions_have_one_row_each():
     model = linear_model([0.0, 0.0, 1.0, 2.0, 3.0], DQNAP)
     image, values, actor = mesh(plot_permissibility(model, limits=(-1, 1)))
     assert image[:, 0] == pytest.approx(sigmoid([1, 2, 3]))
@@ -93,7 +93,7 @@ def test_discrete_actions():
     assert len(actor) == len(values)
 
 
-def test_what_k_holds_gives_limits_and_the_state_that_is_held():
+def test_limits_come_from_k_without_advancing_its_generator():
     model = build(DDPGAP).learn(100)
     generator = model.replay_buffer.knowledge.rng.bit_generator.state
     _, values, _ = mesh(plot_permissibility(model, 1))
@@ -101,20 +101,20 @@ def test_what_k_holds_gives_limits_and_the_state_that_is_held():
     assert model.replay_buffer.knowledge.rng.bit_generator.state == generator
 
 
-def test_after_load_there_is_no_k(tmp_path):
+def test_loaded_model_is_plotted_without_k(tmp_path):
     model = build(DDPGAP).learn(100)
     model.save(tmp_path / "model")
     loaded = DDPGAP.load(tmp_path / "model")
     figure = plot_permissibility(loaded)
     _, values, _ = mesh(figure)
     seen = model.replay_buffer.knowledge.observations[""]
-    assert (loaded.typical_observation == seen).all(axis=1).any()  # a state that occurred is held, as before the saving
+    assert (loaded.typical_observation == seen).all(axis=1).any()  # one that occurred, as before saving
     np.testing.assert_array_equal(loaded.typical_observation, model.replay_buffer.knowledge.typical_observation())
     assert figure.axes[0].get_title() == ""
     assert (values[0], values[-1]) == (-1, 1)
 
 
-def test_axes_are_in_the_environments_units_whatever_the_policy_sees():
+def test_axes_are_in_env_units_under_vec_normalize():
     env = VecNormalize(DummyVecEnv([Line]))
     env.obs_rms.mean, env.obs_rms.var = np.array([5.0, 0.0]), np.array([4.0, 1.0])
     model = linear_model([1.0, 0.0, 0.0], env=env)
@@ -123,17 +123,17 @@ def test_axes_are_in_the_environments_units_whatever_the_policy_sees():
 
 
 @pytest.mark.parametrize("arguments", [{"variable": 2}, {"variable": -1}, {"action": 1}])
-def test_indices_that_do_not_exist_are_told(arguments):
+def test_indices_that_do_not_exist_are_refused(arguments):
     with pytest.raises(ValueError, match="no such variable"):
         plot_permissibility(linear_model([0.0, 0.0, 0.0]), **arguments)
 
 
-def test_without_a_fitted_predictor_there_is_nothing_to_draw():
+def test_plot_without_a_fitted_predictor_is_refused():
     with pytest.raises(ValueError, match="train it first"):
         plot_permissibility(build(DDPGAP))
 
 
-def test_return_curves(tmp_path):
+def test_return_curves_show_each_run_and_the_mean(tmp_path):
     for name, returns in {"a": [1, 3], "b": [5, 7]}.items():
         rows = "".join(f"{r},10,{10 * i}\n" for i, r in enumerate(returns))
         (tmp_path / name).mkdir()
@@ -147,6 +147,6 @@ def test_return_curves(tmp_path):
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["both", "one"]
 
 
-def test_missing_monitor_files_are_told(tmp_path):
+def test_missing_monitor_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="as SB3's Monitor writes"):
         return_curves({"a": tmp_path / "nothing"})

@@ -1,4 +1,4 @@
-"""Statistics of few runs, against figures computed in the head."""
+"""Statistics of few runs, compared with numbers that can be computed in the head."""
 
 import numpy as np
 import pytest
@@ -14,11 +14,11 @@ def test_interval_of_equal_runs_is_a_point():
     assert bootstrap_interval(np.full((10, 4), 0.9)) == pytest.approx((0.9, 0.9))
 
 
-def test_interval_holds_the_mean_and_resamples_within_tasks():
+def test_interval_contains_the_mean_and_resamples_within_tasks():
     scores = np.random.default_rng(0).normal(0.5, 0.1, (10, 4))
     low, high = bootstrap_interval(scores)
     assert low < interquartile_mean(scores) < high
-    # Tasks that differ only between each other leave nothing to resample.
+    # If only tasks differ from each other, every resample is the same.
     assert bootstrap_interval(np.tile([0.0, 1.0, 2.0, 3.0], (10, 1))) == (1.5, 1.5)
 
 

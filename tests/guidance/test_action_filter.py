@@ -1,4 +1,4 @@
-"""Guided prediction and the choice among candidates, by hand."""
+"""`predict(guided=True)` and `GuidedPolicy`, with a stub predictor."""
 
 import numpy as np
 import pytest
@@ -11,10 +11,10 @@ from toy import GUIDED, Line, build
 from sb3_sap import DDPGAP, GuidedPolicy
 
 
-def predicting(rule, actor=0.0, env=None, **settings):
-    """A trained model whose actor always answers ``actor`` (scaled) and whose E follows ``rule``."""
+def predicting(logits_of, actor=0.0, env=None, **settings):
+    """A trained model whose actor always returns ``actor`` (scaled) and whose predictor has the given logits."""
     model = build(DDPGAP, env, **settings).learn(30)
-    model.predictor = StubPredictor(rule)
+    model.predictor = StubPredictor(logits_of)
     with th.no_grad():
         for parameter in model.actor.mu[-2].parameters():
             parameter.zero_()
@@ -25,11 +25,11 @@ def predicting(rule, actor=0.0, env=None, **settings):
 OBS = np.array([[0.3, 0.1], [-0.2, 0.5]], dtype=np.float32)
 
 
-def test_unasked_the_actor_alone_answers():
+def test_predict_returns_the_actors_action_unless_guided():
     np.testing.assert_allclose(predicting(never, 0.25).predict(OBS)[0], [[0.25], [0.25]], atol=1e-6)
 
 
-def test_a_rejected_action_moves_to_the_nearest_permissible_candidate():
+def test_rejected_action_is_replaced_by_the_nearest_permissible_candidate():
     model = predicting(above(0.5), n_candidates=100)
     actions, _ = model.predict(OBS, deterministic=True, guided=True)
     assert actions.shape == (2, 1)
@@ -37,41 +37,41 @@ def test_a_rejected_action_moves_to_the_nearest_permissible_candidate():
     np.testing.assert_array_equal(actions, model.predict(OBS, guided=True)[0])
 
 
-def test_others_in_a_batch_change_nothing():
+def test_guided_action_is_the_same_alone_and_in_a_batch():
     model = predicting(above(0.5), env=Line(dim=2), n_candidates=20)
     batch = np.repeat(OBS, 3, axis=0)
     alone = [model.predict(obs, deterministic=True, guided=True)[0] for obs in batch]
     np.testing.assert_array_equal(model.predict(batch, deterministic=True, guided=True)[0], alone)
 
 
-def test_raw_observations_cannot_be_had_without_their_statistics(tmp_path):
-    asked = []
+def test_guided_prediction_without_the_statistics_of_vec_normalize_is_refused(tmp_path):
+    seen = []
 
-    def rule(obs, actions):
-        asked.append(obs)
+    def allow(obs, actions):
+        seen.append(obs)
         return np.ones(len(actions), dtype=bool)
 
     env = VecNormalize(DummyVecEnv([Line]))
-    build(DDPGAP, env, permissible_actions=rule).learn(30).save(tmp_path / "model")
-    asked.clear()
+    build(DDPGAP, env, permissible_actions=allow).learn(30).save(tmp_path / "model")
+    seen.clear()
     with pytest.raises(ValueError, match=r"load\(path, env=...\)"):
         DDPGAP.load(tmp_path / "model").predict(OBS, guided=True)
-    model = DDPGAP.load(tmp_path / "model", env=env, permissible_actions=rule)
+    model = DDPGAP.load(tmp_path / "model", env=env, permissible_actions=allow)
     model.predict(env.normalize_obs(OBS), guided=True)
-    np.testing.assert_allclose(asked[-1][[0, -1]], OBS, atol=1e-5)
+    np.testing.assert_allclose(seen[-1][[0, -1]], OBS, atol=1e-5)
 
 
-def test_a_permissible_action_is_the_actors_own_to_the_bit():
+def test_permissible_action_is_returned_to_the_bit():
     model = predicting(above(0.0), 0.3)
     np.testing.assert_array_equal(model.predict(OBS, guided=True)[0], model.predict(OBS)[0])
 
 
-def test_without_a_permissible_candidate_the_actor_decides():
+def test_without_a_permissible_candidate_the_actors_action_is_returned():
     model = predicting(deny, 0.3)
     np.testing.assert_array_equal(model.predict(OBS, guided=True)[0], model.predict(OBS)[0])
 
 
-def test_each_row_by_itself_and_a_single_observation():
+def test_rows_are_filtered_separately_and_a_single_observation_gives_a_single_action():
     model = predicting(lambda obs, actions: actions[:, 0] * obs[:, 0], 0.25)
     actions, _ = model.predict(OBS, guided=True)
     assert actions[0] == pytest.approx(0.25)
@@ -81,21 +81,21 @@ def test_each_row_by_itself_and_a_single_observation():
     assert single < 0
 
 
-def test_type_2_needs_no_fitted_predictor():
+def test_permissible_actions_filter_before_the_first_fit():
     model = build(DDPGAP, permissible_actions=lambda obs, actions: actions[:, 0] > 0.5)
     assert not model.predictor.fitted
     assert (model.predict(OBS, guided=True)[0] > 0.5).all()
 
 
-def test_type_2_sees_raw_observations():
+def test_permissible_actions_get_raw_observations_in_guided_prediction():
     env = VecNormalize(DummyVecEnv([lambda: Line(low=2.0, high=10.0)]))
     seen = []
 
-    def rule(obs, actions):
+    def allow(obs, actions):
         seen.append(obs)
         return actions[:, 0] > 8
 
-    model = build(DDPGAP, env, permissible_actions=rule).learn(30)
+    model = build(DDPGAP, env, permissible_actions=allow).learn(30)
     raw = np.array([[0.5, 0.3]], dtype=np.float32)
     seen.clear()
     actions, _ = model.predict(env.normalize_obs(raw), guided=True)
@@ -104,7 +104,7 @@ def test_type_2_sees_raw_observations():
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_the_wrapper_serves_evaluate_policy(algorithm):
+def test_guided_policy_works_with_evaluate_policy(algorithm):
     env = Line()
     model = build(algorithm, env).learn(60)
     model.predictor = StubPredictor(above(0.5))

@@ -17,71 +17,71 @@ from sb3_sap import DDPGAP, DDPGAPCE2
 
 
 @pytest.mark.parametrize("steps_taken", [10, 19])
-def test_until_t_k_actor_and_noise_and_no_consultation(steps_taken):  # lines 1-4
+def test_until_t_k_the_action_is_the_actors_plus_noise_without_a_query(steps_taken):  # lines 1-4
     model = guided([[0.125]], never, learning_starts=10, t_k=20, action_noise=Constant(0.25))
     model.num_timesteps = steps_taken  # the step about to be taken is t = steps_taken + 1 <= t_k
     action, scaled = sample(model, model.action_noise)
     assert action == scaled == pytest.approx(0.375)
 
 
-def test_the_uniform_warm_up_counts_inside_t_k():
+def test_uniform_warm_up_lies_within_t_k():
     model = guided([[0.125]], never, learning_starts=10, t_k=20, action_noise=Constant(0.0))
     model.num_timesteps = 9
     model.action_space.sample = lambda: np.float32([0.75])
     assert sample(model, model.action_noise)[1] == 0.75
 
 
-def test_after_t_k_no_noise():  # line 2
+def test_after_t_k_the_action_has_no_noise():  # line 2
     model = guided([[0.125]], above(0), learning_starts=10, t_k=20, action_noise=Constant(0.25))
     model.num_timesteps = 20
     action, scaled = sample(model, model.action_noise)
     assert action == scaled == np.float32(0.125)
     assert model.action_noise.calls == 0
-    assert model.predictor.asked == [1]
+    assert model.predictor.queries == [1]
 
 
-def test_after_t_k_no_warm_up():
+def test_after_t_k_there_is_no_uniform_warm_up():
     model = guided([[0.125]], above(0), learning_starts=10, t_k=5)
     model.num_timesteps = 5
     model.action_space.sample = Mock(side_effect=AssertionError)
     assert sample(model)[1] == np.float32(0.125)
 
 
-def test_where_guidance_ends_the_base_is_by_itself_again_with_its_noise():
+def test_after_guidance_end_the_base_algorithm_explores_with_its_noise():
     model = guided([[0.125]], never, learning_starts=10, t_k=20, guidance_end=50, action_noise=Constant(0.25))
     model.num_timesteps = 50
     model.action_space.sample = Mock(side_effect=AssertionError)  # no second warm-up
     assert sample(model, model.action_noise)[1] == pytest.approx(0.375)
     model.num_timesteps, model.predictor = 49, StubPredictor(above(0), True)
     assert sample(model, model.action_noise)[1] == np.float32(0.125)
-    assert model.predictor.asked == [1]
+    assert model.predictor.queries == [1]
 
 
-def test_the_end_of_guidance_is_counted_over_several_learns():
+def test_guidance_end_counts_the_steps_of_all_learns():
     model = build(DDPGAP, guidance_end=30).learn(20)
     assert not model.guidance_ended
     model.learn(10)
     assert model.guidance_ended
 
 
-def test_not_consulted():  # line 5
+def test_predictor_is_not_queried_with_alpha_zero():  # line 5
     action, scaled = sample(guided([[-0.25]], never, alpha=0.0))
     assert action == scaled == np.float32(-0.25)
 
 
-def test_not_consulted_before_the_first_fit():
+def test_predictor_is_not_queried_before_its_first_fit():
     action, scaled = sample(guided([[-0.25]], never, fitted=False))
     assert action == scaled == np.float32(-0.25)
 
 
-def test_permissible_action_is_kept():  # lines 6-7
+def test_permissible_action_is_executed_unchanged():  # lines 6-7
     model = guided([[0.125]], above(0))
     action, scaled = sample(model)
     assert action == scaled == np.float32(0.125)
-    assert model.predictor.asked == [1]
+    assert model.predictor.queries == [1]
 
 
-def test_a_logit_of_zero_is_not_permissible():
+def test_logit_of_zero_is_not_permissible():
     assert sample(guided([[0.25]], above(0.25)))[1] > 0.25
 
 
@@ -90,10 +90,10 @@ def test_rejected_action_is_replaced_by_a_permissible_candidate():  # lines 8-11
     action, scaled = sample(model)
     assert 0.5 < scaled.item() <= 1  # only the last of the four strata of [-1, 1] is permissible
     np.testing.assert_allclose(action, scaled, rtol=1e-6)
-    assert model.predictor.asked == [1, 4]
+    assert model.predictor.queries == [1, 4]
 
 
-def test_candidates_cover_the_action_space_and_one_is_taken_at_random():  # lines 8 and 11
+def test_replacement_is_a_random_one_of_candidates_that_cover_the_action_space():  # lines 8 and 11
     model = guided([[-0.25]] * 4000, above(0))
     scaled = sample(model)[1]
     assert scaled.min() > 0
@@ -103,21 +103,21 @@ def test_candidates_cover_the_action_space_and_one_is_taken_at_random():  # line
     assert counts == pytest.approx([500] * 8, abs=85)
 
 
-def test_without_permissible_candidates_the_actor_decides():  # line 10
+def test_without_permissible_candidates_the_actors_action_is_executed():  # line 10
     model = guided([[-0.25]], deny)
     action, scaled = sample(model)
     assert action == scaled == np.float32(-0.25)
-    assert model.predictor.asked == [1, 4]
+    assert model.predictor.queries == [1, 4]
     assert model.logger.name_to_value["sap/fallback_rate"] == 1
 
 
-def test_alpha_is_the_probability_of_consulting():  # line 5
+def test_alpha_is_the_probability_of_querying_the_predictor():  # line 5
     scaled = sample(guided([[-0.25]] * 4000, above(0), alpha=0.3))[1]
     assert np.sum(scaled > 0) == pytest.approx(1200, abs=116)  # 4 standard deviations
 
 
-def test_several_environments_at_once_with_one_call_for_all_candidates():
-    # Permissible means: the sign of the environment's own observation. Environment 2 has nothing permissible.
+def test_candidates_of_all_environments_are_evaluated_in_one_call():
+    # Permissible actions have the sign of the environment's own observation; environment 2 has none.
     model = guided(
         [[-0.5], [-0.375], [0.25], [0.5], [0.125]],
         lambda obs, actions: actions[:, 0] * obs[:, 0],
@@ -130,14 +130,14 @@ def test_several_environments_at_once_with_one_call_for_all_candidates():
     assert scaled[3] < 0
     assert scaled[4] == np.float32(0.125)
     np.testing.assert_allclose(action, scaled, rtol=1e-6)
-    assert model.predictor.asked == [5, 3 * 4]
+    assert model.predictor.queries == [5, 3 * 4]
     values = model.logger.name_to_value
     assert values["sap/consultation_rate"] == 1
     assert values["sap/rejection_rate"] == pytest.approx(3 / 5)
     assert values["sap/fallback_rate"] == pytest.approx(1 / 3)
 
 
-def test_only_the_consulted_are_replaced_and_each_by_its_own_observation():
+def test_only_actions_that_were_queried_are_replaced_each_by_its_own_observation():
     signs = np.where(np.arange(200) % 3 == 0, 1.0, -1.0)
     obs = np.stack([signs, np.zeros(200)], axis=1)
     actor = -0.125 * signs[:, None]  # always wrong
@@ -147,12 +147,12 @@ def test_only_the_consulted_are_replaced_and_each_by_its_own_observation():
     assert 70 < kept.sum() < 130
     assert (np.sign(scaled[~kept]) == signs[~kept]).all()
     rate = model.logger.name_to_value["sap/consultation_rate"]
-    assert model.predictor.asked == [round(200 * rate), 4 * round(200 * rate)]
+    assert model.predictor.queries == [round(200 * rate), 4 * round(200 * rate)]
     assert (~kept).sum() == round(200 * rate)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_two_dimensions_and_other_bounds(dtype):
+def test_replacement_respects_dimensions_and_bounds_of_the_action_space(dtype):
     # Scaled, the actor's (4, 6) of [2, 10]² is (-1/2, 0); permissible is where both are above 1/2: one stratum each.
     env = Line(dim=2, low=2.0, high=10.0, action_dtype=dtype)
     model = guided([[4, 6]] * 300, lambda obs, actions: actions.min(dim=1).values - 0.5, env=env)
@@ -166,7 +166,7 @@ def test_two_dimensions_and_other_bounds(dtype):
     assert action.shape == scaled.shape == (300, 2)
 
 
-def test_an_action_space_of_shape_2_by_2():
+def test_action_space_of_shape_2_by_2_is_guided():
     env = Line()
     env.action_space = spaces.Box(-1, 1, (2, 2), np.float32)
     actor = np.full((3, 2, 2), -0.2)
@@ -188,17 +188,17 @@ def test_both_buffers_hold_the_executed_action(algorithm, low):
     model = build(algorithm, env, alpha=1.0, alpha_low=1.0, n_candidates=8, t_k=10)
     model.predictor = StubPredictor(lambda obs, actions: actions[:, 0] - 0.6)
     model.learn(80)
-    assert model.predictor.asked
+    assert model.predictor.queries
     stored = model.replay_buffer.actions[:40]  # (40, 2 environments, 2 dimensions)
     executed = np.stack([inner.executed for inner in env.envs], axis=1)
     np.testing.assert_allclose(low + (stored + 1) / 2 * (5 - low), executed, rtol=1e-5, atol=1e-5)
-    assert (stored[10:, :, 0] > 0.6).mean() > 0.8  # guidance did act
+    assert (stored[10:, :, 0] > 0.6).mean() > 0.8  # guidance was active
     knowledge = model.replay_buffer.knowledge
     in_k = np.concatenate([knowledge.actions[knowledge._offset[p] :][: len(s)] for p, s in knowledge.parts.items()])
     np.testing.assert_array_equal(np.sort(in_k, axis=0), np.sort(stored.reshape(-1, 2), axis=0))
 
 
-def test_predict_is_the_actor_alone():
+def test_predict_returns_the_actors_action_without_a_query():
     model = build(DDPGAP, alpha=1.0, alpha_low=1.0).learn(30)
     model.predictor = StubPredictor(never)
     obs = np.array([0.3, 0.1], dtype=np.float32)
@@ -209,13 +209,13 @@ def test_predict_is_the_actor_alone():
 # ---------------------------------------------------------------- whole runs
 
 
-def test_t_k_left_open_is_learning_starts():
+def test_t_k_defaults_to_learning_starts():
     assert build(DDPGAP, learning_starts=17).noise_steps == 17
     assert build(DDPGAP, learning_starts=17, t_k=0).noise_steps == 0
     assert build(DDPGAP, learning_starts=17, t_k=40, action_noise=Constant(0.0)).noise_steps == 40
 
 
-def test_noise_ends_with_t_k_and_a_second_learn_does_not_bring_it_back():
+def test_noise_ends_at_t_k_and_does_not_return_in_a_second_learn():
     model = build(DDPGAP, learning_starts=10, t_k=20, action_noise=Constant(0.1), alpha=0.0)
     predicted = []
     predict = model.predict
@@ -232,7 +232,7 @@ def test_noise_ends_with_t_k_and_a_second_learn_does_not_bring_it_back():
     assert model.action_noise.calls == 20
 
 
-def test_t_k_is_counted_over_several_short_learns():
+def test_t_k_counts_the_steps_of_all_learns():
     model = build(DDPGAP, learning_starts=0, t_k=20, action_noise=Constant(0.1), alpha=0.0)
     for _ in range(2):
         model.learn(8)
@@ -240,17 +240,17 @@ def test_t_k_is_counted_over_several_short_learns():
     assert model.action_noise.calls == 20
 
 
-def test_with_a_constraint_the_candidates_come_from_its_interval():
-    # E allows what is above -0.5, the constraint what is within 0.5 of the last action.
+def test_candidates_come_from_the_interval_of_the_constraint():
+    # The predictor permits actions above -0.5, the constraint those within 0.5 of the last action.
     model = guided([[-0.75]] * 500, above(-0.5), algorithm=DDPGAPCE2, constraint=nearby)
     model._previous = [(np.zeros(2), np.float32([0.5]))] * 500
     scaled = sample(model)[1]
     assert scaled.min() >= 0
-    assert model.predictor.asked == [500]  # the uniform draw from [0, 1] already pleases E
-    model.predictor.rule = above(0.75)
-    model.predictor.asked.clear()
+    assert model.predictor.queries == [500]  # the uniform draw from [0, 1] is already permissible
+    model.predictor.logits_of = above(0.75)
+    model.predictor.queries.clear()
     scaled = sample(model)[1]
     # Of the four strata of [0, 1] the last, [0.75, 1], is permissible.
     assert scaled.min() > 0.75
-    assert model.predictor.asked[0] == 500
-    assert model.predictor.asked[1] == pytest.approx(4 * 375, abs=160)
+    assert model.predictor.queries[0] == 500
+    assert model.predictor.queries[1] == pytest.approx(4 * 375, abs=160)

@@ -1,4 +1,4 @@
-"""The permissible actor loss: what it moves, what it leaves alone, and that it teaches the actor."""
+"""The auxiliary (permissibility) loss: which parameters it changes, in which direction, and how often."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def same(one, other):
     return all(th.equal(value, other[name]) for name, value in one.items())
 
 
-def test_one_step_is_the_gradient_of_the_cross_entropy():
+def test_actor_step_follows_the_gradient_of_the_cross_entropy():
     model = build(DDPGAP).learn(40)
     model.actor.optimizer = th.optim.SGD(model.actor.parameters(), lr=0.5)
     before = weights(model.actor)
@@ -46,7 +46,7 @@ def test_one_step_is_the_gradient_of_the_cross_entropy():
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_it_moves_the_actor_alone(algorithm):
+def test_actor_step_changes_the_actor_only(algorithm):
     model = build(algorithm).learn(60)
     predictor, critic, actor = weights(model.predictor), weights(model.critic), weights(model.actor)
     gradients = {name: parameter.grad.clone() for name, parameter in model.predictor.named_parameters()}
@@ -58,7 +58,7 @@ def test_it_moves_the_actor_alone(algorithm):
     assert not same(weights(model.actor), actor)
 
 
-def test_running_statistics_stand_still():
+def test_actor_step_leaves_running_statistics_unchanged():
     model = build(CrossQAP).learn(60)
     before = {name: value.clone() for name, value in model.actor.named_buffers()}
     assert before
@@ -67,7 +67,7 @@ def test_running_statistics_stand_still():
     assert same(dict(model.actor.named_buffers()), before)
 
 
-def test_the_spread_of_a_stochastic_policy_is_left_alone():
+def test_actor_step_leaves_the_standard_deviation_of_a_stochastic_policy_unchanged():
     model = build(SACAP).learn(60)
     before = weights(model.actor.log_std)
     permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
@@ -75,8 +75,8 @@ def test_the_spread_of_a_stochastic_policy_is_left_alone():
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_it_teaches_the_actor_what_e_knows(algorithm):
-    """E learns from 400 random steps; right of the centre only going left is permissible."""
+def test_actor_steps_lead_to_actions_that_are_predicted_permissible(algorithm):
+    """The predictor learns from 400 random steps; right of the centre only going left is permissible."""
     model = build(algorithm, learning_starts=400, learning_rate=0.01, **WIDE).learn(400)
     assert model.validation_accuracy > 0.7
     for _ in range(200):
@@ -85,7 +85,7 @@ def test_it_teaches_the_actor_what_e_knows(algorithm):
     assert np.array_equal(np.sign(mean_action(model, rows)[:, 0]), [1, 1, -1, -1])
 
 
-def test_zero_is_the_papers_method_to_the_bit_and_a_schedule_works():
+def test_coefficient_of_zero_changes_no_bit_and_a_schedule_is_followed():
     plain, zero = build(DDPGAP).learn(80), build(DDPGAP, actor_permissibility_coef=lambda _: 0.0).learn(80)
     assert same(weights(plain.policy), weights(zero.policy))
     some = build(DDPGAP, actor_permissibility_coef=lambda remaining: remaining).learn(80)
@@ -95,14 +95,14 @@ def test_zero_is_the_papers_method_to_the_bit_and_a_schedule_works():
 
 
 @pytest.mark.parametrize("value", ["const_1", "lin_", "lin_x", "1"])
-def test_a_schedule_that_is_none_is_told(value):
+def test_invalid_schedule_is_refused(value):
     with pytest.raises(
         ValueError, match=r"`actor_permissibility_coef` must be a number, a schedule or \"lin_<number>\""
     ):
         build(DDPGAP, actor_permissibility_coef=value)
 
 
-def test_it_waits_until_e_is_good_enough(monkeypatch):
+def test_auxiliary_loss_is_not_applied_while_the_predictor_is_inaccurate(monkeypatch):
     calls = []
     monkeypatch.setattr(
         "sb3_sap.guidance.auxiliary_update.permissible_actor_step", lambda *args: calls.append(args) or 0.0
@@ -125,10 +125,10 @@ def test_it_waits_until_e_is_good_enough(monkeypatch):
         (DDPGAP, {"refit_growth": 0.25, "teaching_growth": 0.0}, [1, 2, 3, 7]),
         (DDPGAP, {"teaching_growth": 0.25}, [1, 2, 2, 5]),
         (TD3AP, {}, [1, 2, 3, 7]),
-        (TD3AP, {"teaching_growth": 0.0}, [0, 1, 1, 3]),  # TD3 moves its actor at every second update
+        (TD3AP, {"teaching_growth": 0.0}, [0, 1, 1, 3]),  # TD3 updates its actor once every two critic updates
     ],
 )
-def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, algorithm, growths, numbers):
+def test_auxiliary_loss_follows_the_schedule_of_the_fits_or_its_own(monkeypatch, algorithm, growths, numbers):
     calls = []
     monkeypatch.setattr(
         "sb3_sap.guidance.auxiliary_update.permissible_actor_step", lambda *args: calls.append(args) or 0.0
@@ -144,7 +144,7 @@ def test_it_acts_as_often_as_e_is_fitted_or_in_its_own_rhythm(monkeypatch, algor
 
 
 @pytest.mark.parametrize(("growth", "last"), [(None, 59), (0.0, 100)])
-def test_it_ends_with_guidance_unless_it_has_a_rhythm_of_its_own(monkeypatch, growth, last):
+def test_auxiliary_loss_ends_with_guidance_unless_it_has_its_own_schedule(monkeypatch, growth, last):
     steps = []
     monkeypatch.setattr(DDPGAP, "predictor_accurate", True)
     model = build(DDPGAP, actor_permissibility_coef=1.0, guidance_end=60, teaching_growth=growth)
@@ -160,7 +160,7 @@ def test_it_ends_with_guidance_unless_it_has_a_rhythm_of_its_own(monkeypatch, gr
 
 
 class Permits:
-    """E that permits the given actions where x > 0, and every action elsewhere."""
+    """A predictor that permits the given actions where x > 0, and every action elsewhere."""
 
     def __init__(self, *actions):
         self.actions = th.tensor(actions)
@@ -177,7 +177,7 @@ def discrete(algorithm, **settings):
 
 
 @pytest.mark.parametrize("algorithm", DISCRETE)
-def test_rejected_values_sink_below_the_best_permitted(algorithm):
+def test_value_step_moves_rejected_values_below_the_best_permitted_value(algorithm):
     model = discrete(algorithm)
     model.policy.optimizer = th.optim.SGD(model.policy.parameters(), lr=0.5)
     net = model.q_net if algorithm is DQNAP else model.quantile_net
@@ -187,7 +187,7 @@ def test_rejected_values_sink_below_the_best_permitted(algorithm):
     right = observations[:, 0] > 0
     assert 0 < right.sum() < 32
     values = net(observations) if algorithm is DQNAP else net(observations).mean(dim=1)
-    # Action 0 is rejected where x > 0, of 1 and 2 the better one stands against it.
+    # Where x > 0, action 0 is rejected; it is compared with the better one of 1 and 2.
     excess = values[right, 0] - values[right, 1:].max(dim=1).values
     expected = 2.0 * th.log1p(th.exp(excess)).mean()
     gradients = th.autograd.grad(expected, list(net.parameters()))
@@ -202,7 +202,7 @@ def test_rejected_values_sink_below_the_best_permitted(algorithm):
 
 
 @pytest.mark.parametrize("permitted", [(), (0, 1, 2)])
-def test_where_e_tells_no_actions_apart_nothing_moves(permitted):
+def test_value_step_changes_nothing_if_all_or_no_actions_are_permitted(permitted):
     model = discrete(DQNAP)
     before = weights(model.policy)
     assert permissible_value_step(model, Permits(*permitted), model.replay_buffer, coef=1.0, batch_size=32) == 0.0
@@ -210,7 +210,7 @@ def test_where_e_tells_no_actions_apart_nothing_moves(permitted):
 
 
 @pytest.mark.parametrize("algorithm", DISCRETE)
-def test_it_teaches_the_values_what_e_knows(algorithm):
+def test_value_steps_lead_to_greedy_actions_that_are_predicted_permissible(algorithm):
     settings = {"learning_starts": 400, "learning_rate": 0.01, "predictor_gradient_steps": -1, **WIDE}
     model = build(algorithm, Line(n_actions=2), **settings).learn(400)
     assert model.validation_accuracy > 0.7
@@ -220,7 +220,7 @@ def test_it_teaches_the_values_what_e_knows(algorithm):
     assert model.predict(rows, deterministic=True)[0].tolist() == [1, 1, 0, 0]
 
 
-def test_values_are_taught_while_learning_and_zero_changes_no_bit():
+def test_auxiliary_loss_changes_values_in_training_and_a_coefficient_of_zero_no_bit():
     plain, zero, some = (discrete(QRDQNAP, actor_permissibility_coef=coef) for coef in (0.0, lambda _: 0.0, 1.0))
     assert same(weights(plain.policy), weights(zero.policy))
     assert not same(weights(plain.policy), weights(some.policy))
@@ -228,7 +228,7 @@ def test_values_are_taught_while_learning_and_zero_changes_no_bit():
 
 
 class Frozen(FlattenExtractor):
-    """Begins with a layer that is not trained."""
+    """The first layer is not trained."""
 
     def __init__(self, space):
         super().__init__(space)
@@ -239,7 +239,7 @@ class Frozen(FlattenExtractor):
 
 
 @pytest.mark.parametrize("algorithm", [DDPGAP, SACAP, CrossQAP, *DISCRETE])
-def test_frozen_layers_stay_as_they_are_and_the_others_learn(algorithm):
+def test_frozen_layers_remain_unchanged_while_the_others_learn(algorithm):
     policy_kwargs = {"net_arch": [8], "features_extractor_class": Frozen}
     model = build(algorithm, policy_kwargs=policy_kwargs, actor_permissibility_coef=1.0)
     before = weights(model.policy)
@@ -248,10 +248,10 @@ def test_frozen_layers_stay_as_they_are_and_the_others_learn(algorithm):
     after = weights(model.policy)
     changed = {name for name, value in before.items() if not th.equal(value, after[name])}
     assert changed
-    assert not [name for name in changed if "extractor" in name and "target" not in name]  # averaging rounds
+    assert not [name for name in changed if "extractor" in name and "target" not in name]  # Polyak averaging rounds
 
 
-def test_an_actor_that_is_frozen_altogether_stays_as_it_is():
+def test_fully_frozen_actor_remains_unchanged():
     model = build(DDPGAP).learn(30)
     model.actor.requires_grad_(False)
     before = weights(model.actor)

@@ -1,3 +1,5 @@
+"""The candidates of Algorithm 1, which are stratified [line 8], and the choice among them [line 11]."""
+
 import numpy as np
 import pytest
 import torch as th
@@ -11,7 +13,7 @@ from sb3_sap.guidance.values import q_values
 OBS = np.array([[0.3, 0.1], [-0.2, 0.5]], dtype=np.float32)
 
 
-def test_choose():
+def test_choice_is_the_best_or_a_random_permissible_candidate():
     candidates = np.arange(6).reshape(2, 3, 1)
     permissible = np.array([[True, False, True], [False, True, True]])
     scores = np.array([[1.0, 9.0, 2.0], [9.0, 3.0, 2.0]])
@@ -24,14 +26,14 @@ def test_choose():
 @pytest.mark.parametrize(
     ("selection", "low", "high"), [("nearest", 0.0, 0.02), ("most_permissible", 0.98, 1.0), ("random", 0.0, 1.0)]
 )
-def test_selection_by_name(selection, low, high):
+def test_candidate_selection_takes_the_nearest_the_most_permissible_or_a_random_one(selection, low, high):
     scaled = sample(guided([[-0.25]] * 20, above(0), n_candidates=100, candidate_selection=selection))[1]
     assert ((scaled > low) & (scaled <= high)).all()
     assert (scaled.std() > 0.1) == (selection == "random")
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_highest_q_is_the_critics_choice(algorithm):
+def test_highest_q_selection_follows_the_critic(algorithm):
     model = build(algorithm, alpha=1.0, alpha_low=1.0).learn(60)
     obs, actions = th.as_tensor(np.repeat(OBS, 2, axis=0)), th.tensor([[-0.5], [0.5], [-0.5], [0.5]])
     with th.no_grad():
@@ -48,10 +50,10 @@ def test_highest_q_is_the_critics_choice(algorithm):
         with th.no_grad():
             q = q_values(model, th.as_tensor(np.repeat(row[None], 50, axis=0)), grid)
             chosen = q_values(model, th.as_tensor(row[None]), th.as_tensor(action[None]))
-        assert chosen >= q.max() - (q.max() - q.min()) * 0.15 - 1e-6  # the candidates are a grid of their own
+        assert chosen >= q.max() - (q.max() - q.min()) * 0.15 - 1e-6  # the candidates are not those of the grid
 
 
-def test_critics_statistics_stand_still():
+def test_q_values_leave_the_running_statistics_of_the_critic_unchanged():
     model = build(GUIDED[-1]).learn(60)
     before = {name: value.clone() for name, value in model.critic.named_buffers()}
     assert before
@@ -60,14 +62,14 @@ def test_critics_statistics_stand_still():
     assert all(th.equal(value, before[name]) for name, value in model.critic.named_buffers())
 
 
-def test_an_unknown_selection_is_refused():
+def test_unknown_candidate_selection_is_refused():
     with pytest.raises(ValueError, match=r"^`candidate_selection` must be one of 'random', .* but is 'best'"):
         build(SACAP, candidate_selection="best")
     assert SELECTIONS[0] == "random"
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
-def test_one_candidate_per_stratum_in_each_dimension(dim):
+def test_each_stratum_of_each_dimension_has_one_candidate(dim):
     low = np.float32([[-1] * dim, [0] * dim])
     high = np.float32([[1] * dim, [10] * dim])
     candidates = stratified_candidates(np.random.default_rng(0), low, high, 16)
@@ -77,7 +79,7 @@ def test_one_candidate_per_stratum_in_each_dimension(dim):
     np.testing.assert_array_equal(np.sort(strata, axis=1), np.broadcast_to(np.arange(16)[:, None], (2, 16, dim)))
 
 
-def test_dimensions_and_rows_are_paired_at_random():
+def test_strata_of_dimensions_and_rows_are_paired_at_random():
     zeros = np.zeros((2, 2), np.float32)
     candidates = stratified_candidates(np.random.default_rng(0), zeros, zeros + 1, 1000)
     for row in candidates:
@@ -97,6 +99,6 @@ def test_candidates_are_uniform_within_the_bounds():
     assert counts == pytest.approx([800] * 10, abs=108)
 
 
-def test_an_interval_of_one_point_gives_that_point():
+def test_interval_of_one_point_gives_that_point():
     point = np.float32([[0.125]])
     assert (stratified_candidates(np.random.default_rng(0), point, point, 5) == point).all()

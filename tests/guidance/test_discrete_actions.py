@@ -1,4 +1,4 @@
-"""The guided algorithms of discrete action spaces: what differs from the continuous ones, by hand."""
+"""The guided algorithms for discrete actions, where they differ from those for continuous ones."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from states import assert_same, reseed
+from states import assert_same_state, reseed
 from toy import DISCRETE, Line, build
 
 from sb3_sap import DQNAP, QRDQNAP, GuidedPolicy
@@ -19,7 +19,7 @@ BASE = {DQNAP: stable_baselines3.DQN, QRDQNAP: sb3_contrib.QRDQN}
 
 
 class Allows:
-    """E that finds the given actions permissible, in every state."""
+    """A predictor that permits the given actions in every state."""
 
     def __init__(self, *actions):
         self.actions, self.fitted = th.tensor(actions), True
@@ -50,7 +50,7 @@ def guided(algorithm, greedy, predictor, n_envs=2000, **settings):
 
 
 @every_algorithm
-def test_a_rejected_action_is_replaced_by_a_random_permissible_one(algorithm):
+def test_rejected_action_is_replaced_by_a_random_permissible_one(algorithm):
     action, stored = guided(algorithm, 0, Allows(1, 3))
     np.testing.assert_array_equal(action, stored)
     assert np.issubdtype(action.dtype, np.integer)
@@ -60,19 +60,19 @@ def test_a_rejected_action_is_replaced_by_a_random_permissible_one(algorithm):
 
 
 @every_algorithm
-def test_a_permissible_action_is_kept_and_so_is_the_last_resort(algorithm):
+def test_action_is_executed_unchanged_if_it_is_permissible_or_if_none_is(algorithm):
     assert set(guided(algorithm, 1, Allows(1, 3))[0]) == {1}
     assert set(guided(algorithm, 0, Allows())[0]) == {0}
 
 
 @every_algorithm
-def test_what_the_user_forbids_is_no_candidate(algorithm):
+def test_action_forbidden_by_the_user_is_no_candidate(algorithm):
     action, _ = guided(algorithm, 0, Allows(1, 3), permissible_actions=lambda obs, actions: actions != 3)
     assert set(action) == {1}
 
 
 @every_algorithm
-def test_the_highest_q_wins(algorithm):
+def test_highest_q_selection_takes_the_best_permissible_action(algorithm):
     model = build(algorithm, Line(n_actions=4), candidate_selection="highest_q", alpha=1.0, alpha_low=1.0).learn(60)
     obs = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
     tensor = th.as_tensor(obs)
@@ -90,7 +90,7 @@ def test_the_highest_q_wins(algorithm):
 
 
 @every_algorithm
-def test_e_learns_and_guides_the_greedy_actions(algorithm):
+def test_predictor_learns_and_guides_the_greedy_actions(algorithm):
     # 400 random steps; right of the centre only going left, or standing still, is permissible.
     model = build(algorithm, learning_starts=400, dataset_size=64, predictor_kwargs={"net_arch": [32]}).learn(400)
     assert model.predictor_accurate
@@ -103,7 +103,7 @@ def test_e_learns_and_guides_the_greedy_actions(algorithm):
 
 
 @every_algorithm
-def test_knowledge_holds_the_executed_actions(algorithm):
+def test_replay_buffer_holds_the_executed_actions(algorithm):
     env = DummyVecEnv([lambda: Line(n_actions=3)] * 2)
     model = build(algorithm, env, alpha=1.0, alpha_low=1.0, t_k=10)
     model.predictor = Allows(2)
@@ -114,7 +114,7 @@ def test_knowledge_holds_the_executed_actions(algorithm):
 
 
 @every_algorithm
-def test_unguided_it_equals_its_base_to_the_bit_while_e_trains(algorithm):
+def test_unguided_algorithm_with_a_fitted_predictor_equals_its_base_to_the_bit(algorithm):
     settings = {"learning_starts": 10, "buffer_size": 600, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
     base = BASE[algorithm]("MlpPolicy", Line(n_actions=3), seed=1, device="cpu", **settings).learn(150)
     model = build(algorithm, alpha=0.0, alpha_low=0.0).learn(150)
@@ -124,22 +124,22 @@ def test_unguided_it_equals_its_base_to_the_bit_while_e_trains(algorithm):
 
 
 @every_algorithm
-def test_save_load_and_continue_equals_an_interruption(algorithm, tmp_path):
+def test_loaded_model_continues_like_the_saved_one(algorithm, tmp_path):
     model = build(algorithm).learn(120)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
     loaded = algorithm.load(tmp_path / "model", env=Line(n_actions=3))
     loaded.load_replay_buffer(tmp_path / "buffer")
-    assert_same(model, loaded)
+    assert_same_state(model, loaded)
     for one in (model, loaded):
-        one._n_calls = 0  # SB3 saves this counter, but a fresh look at the target network starts both alike
+        one._n_calls = 0  # SB3's counter of calls, on which updates of the target network depend, starts anew for both
         reseed(one)
         one.learn(60, reset_num_timesteps=False)
-    assert_same(model, loaded)
+    assert_same_state(model, loaded)
 
 
 @every_algorithm
-def test_normalised_observations(algorithm):
+def test_predictor_is_fitted_to_normalised_observations(algorithm):
     model = build(algorithm, VecNormalize(DummyVecEnv([lambda: Line(n_actions=3)] * 2))).learn(150)
     assert model.predictor.fitted
 
@@ -165,9 +165,9 @@ def test_settings_of_continuous_actions_are_refused(settings, message):
         build(DQNAP, **settings)
 
 
-def test_the_same_seed_gives_the_same_bits():
+def test_same_seed_gives_the_same_bits():
     runs = []
     for _ in range(2):
         set_random_seed(99)
         runs.append(build(DQNAP).learn(100))
-    assert_same(*runs)
+    assert_same_state(*runs)

@@ -1,4 +1,4 @@
-"""Type-2 permissibility: what `permissible_actions` forbids is never executed, with E or without it."""
+"""Type-2 permissibility: actions that `permissible_actions` forbids are never executed, guided or not."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def nothing(obs, actions):
 
 
 @pytest.mark.parametrize("algorithm", [DDPG, *GUIDED])
-def test_nothing_forbidden_is_ever_executed(algorithm):
+def test_forbidden_actions_are_never_executed(algorithm):
     env = DummyVecEnv([lambda: Line(low=2.0, high=10.0)] * 2)
     settings = {"constraint": None} if algorithm in GUIDED else {}
     build(algorithm, env, permissible_actions=upper_quarter, **settings).learn(80)
@@ -34,38 +34,38 @@ def test_nothing_forbidden_is_ever_executed(algorithm):
     assert executed.std() > 0.1  # drawn, not clipped to the border
 
 
-def test_draws_are_uniform_over_what_is_allowed():
+def test_replacements_are_uniform_over_the_allowed_actions():
     env = Line(horizon=10_000)
     build(DDPG, env, permissible_actions=only_right, learning_starts=2000, buffer_size=2000).learn(2000)
     counts, _ = np.histogram(np.array(env.executed), bins=5, range=(0.5, 1))
     assert counts == pytest.approx([400] * 5, abs=72)  # 4 standard deviations
 
 
-def test_without_any_allowed_candidate_the_action_stays():
+def test_without_an_allowed_candidate_the_action_is_executed_unchanged():
     env, plain = Line(), Line()
     build(DDPG, env, permissible_actions=nothing).learn(40)
     build(DDPG, plain).learn(40)
     np.testing.assert_array_equal(env.executed, plain.executed)
 
 
-def test_a_rule_that_allows_all_changes_no_bit():
+def test_permissible_actions_that_allow_everything_change_no_bit():
     env, plain = Line(), Line()
     build(DDPGAP, env, permissible_actions=lambda obs, actions: np.ones(len(actions), bool)).learn(80)
     build(DDPGAP, plain).learn(80)
     np.testing.assert_array_equal(env.executed, plain.executed)
 
 
-def test_it_meets_the_constraint_in_the_middle():
+def test_permissible_actions_and_constraint_hold_together():
     env = Line()
     build(
         DDPG, env, constraint=lambda *_: (np.float32([-1]), np.float32([0.75])), permissible_actions=only_right
     ).learn(60)
-    executed = np.array(env.executed)[1:]  # a constraint is not asked on an episode's first step
+    executed = np.array(env.executed)[1:]  # a constraint is applied from the second step of each episode
     inside = (executed > 0.5) & (executed <= 0.75)
     assert inside[np.arange(1, 60) % 10 != 0].all()
 
 
-def test_it_sees_raw_observations_and_actions_in_the_units_of_the_environment():
+def test_permissible_actions_get_raw_observations_and_actions_in_env_units():
     seen = []
 
     def spy(obs, actions):
@@ -81,13 +81,13 @@ def test_it_sees_raw_observations_and_actions_in_the_units_of_the_environment():
     assert model.num_timesteps == 40
 
 
-def test_dict_observations():
+def test_permissible_actions_get_dict_observations():
     env = Line("dict")
     build(DDPGAP, env, policy="MultiInputPolicy", permissible_actions=lambda o, a: (o["x"] * a <= 0)[:, 0]).learn(60)
     assert len(env.executed) == 60
 
 
-def test_saved_by_name_and_resolved_again(tmp_path):
+def test_permissible_actions_given_by_name_are_saved_and_resolved_again(tmp_path):
     model = build(DDPGAP, permissible_actions="test_permissible_actions.only_right").learn(20)
     model.save(tmp_path / "model")
     env = Line()
@@ -97,7 +97,7 @@ def test_saved_by_name_and_resolved_again(tmp_path):
 
 @pytest.mark.parametrize("algorithm", [DDPG, DDPGAP, DQNAP])
 @pytest.mark.parametrize(
-    ("rule", "error", "message"),
+    ("function", "error", "message"),
     [
         (
             lambda obs, actions: 1 / 0,
@@ -108,29 +108,29 @@ def test_saved_by_name_and_resolved_again(tmp_path):
         (lambda obs, actions: np.array([True, True]), ValueError, r"returned an array of shape \(2,\) for 1 actions"),
     ],
 )
-def test_a_rule_that_does_not_answer(algorithm, rule, error, message):
+def test_invalid_return_values_are_refused(algorithm, function, error, message):
     with pytest.raises(error, match=message):
-        build(algorithm, permissible_actions=rule).learn(30)
+        build(algorithm, permissible_actions=function).learn(30)
 
 
 def rightmost(obs, actions):
     return actions.reshape(len(actions)) == 2
 
 
-class RuledDQN(ConstrainedExplorationMixin, DQN):
+class ConstrainedDQN(ConstrainedExplorationMixin, DQN):
     pass
 
 
-class RuledQRDQN(ConstrainedExplorationMixin, QRDQN):
+class ConstrainedQRDQN(ConstrainedExplorationMixin, QRDQN):
     pass
 
 
-class RuledSAC(ConstrainedExplorationMixin, SAC):
+class ConstrainedSAC(ConstrainedExplorationMixin, SAC):
     pass
 
 
-@pytest.mark.parametrize("algorithm", [DQNAP, QRDQNAP, RuledDQN, RuledQRDQN])
-def test_a_rule_alone_needs_no_labels_for_finite_actions(algorithm):
+@pytest.mark.parametrize("algorithm", [DQNAP, QRDQNAP, ConstrainedDQN, ConstrainedQRDQN])
+def test_permissible_actions_need_no_labels_for_discrete_actions(algorithm):
     env = Line(n_actions=3, labels=False)
     model = build(algorithm, env, permissible_actions=rightmost).learn(60)
     assert set(map(int, env.executed)) == {2}
@@ -138,13 +138,13 @@ def test_a_rule_alone_needs_no_labels_for_finite_actions(algorithm):
         assert not model.predictor.fitted
 
 
-@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP, RuledSAC])
-def test_nor_for_continuous_ones(algorithm):
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP, ConstrainedSAC])
+def test_permissible_actions_need_no_labels_for_continuous_actions(algorithm):
     env = Line(labels=False)
     build(algorithm, env, permissible_actions=only_right).learn(60)
     assert (np.array(env.executed) > 0.5).all()
 
 
-def test_labels_beside_a_rule_are_learned_from():
+def test_labels_are_stored_beside_permissible_actions():
     model = build(DQNAP, permissible_actions=lambda obs, actions: np.ones(len(actions), bool)).learn(60)
     assert sum(model.replay_buffer.knowledge.seen) == 60

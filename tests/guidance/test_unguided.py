@@ -1,3 +1,5 @@
+"""Without guidance, each algorithm equals its base to the bit; the same seed gives the same bits."""
+
 import numpy as np
 import pytest
 import sb3_contrib
@@ -13,7 +15,7 @@ from sb3_sap import DDPG, DDPGAP, SACAP, TD3AP, TQCAP, CrossQAP
 
 
 def tensors(model):
-    """Everything a model has learned, by name."""
+    """All tensors that a model has learned, by name."""
     found = {}
     for name, state in model.get_parameters().items():
         if name.startswith("predictor"):
@@ -40,10 +42,9 @@ def three():
     return DummyVecEnv([Line] * 3)
 
 
-# Under VecNormalize it equals a base that is given the true last observations: tests/test_vec_envs.py.
 @pytest.mark.parametrize("make_env", [Line, three], ids=["one", "three"])
 @pytest.mark.parametrize("algorithm", [DDPG, DDPGAP])
-def test_unguided_it_equals_ddpg_to_the_bit(algorithm, make_env):
+def test_unguided_ddpg_equals_that_of_sb3_to_the_bit(algorithm, make_env):
     def noise():
         return NormalActionNoise(np.zeros(1), 0.3 * np.ones(1))
 
@@ -53,7 +54,7 @@ def test_unguided_it_equals_ddpg_to_the_bit(algorithm, make_env):
         runs.append(build(cls, make_env(), action_noise=noise(), **extra).learn(150))
         torch_states.append(th.get_rng_state())
     assert_same_to_the_bit(*runs)
-    # DDPG's targets have no noise, so torch's generator shows up in no weight; in other algorithms it would.
+    # The targets of DDPG have no noise, so that no weight depends on torch's generator, as it would elsewhere.
     assert th.equal(*torch_states)
     if algorithm is DDPGAP:
         assert runs[1].predictor.fitted
@@ -68,7 +69,7 @@ BASES = {
 
 
 @pytest.mark.parametrize(("algorithm", "base"), BASES.items(), ids=[algorithm.__name__ for algorithm in BASES])
-def test_unguided_every_algorithm_equals_its_base_to_the_bit(algorithm, base):
+def test_unguided_algorithm_equals_its_base_to_the_bit(algorithm, base):
     plain = build(base).learn(150)
     unguided = build(algorithm, alpha=0.0, t_k=10).learn(150)
     assert_same_to_the_bit(plain, unguided)
@@ -76,7 +77,7 @@ def test_unguided_every_algorithm_equals_its_base_to_the_bit(algorithm, base):
 
 
 @pytest.mark.parametrize("algorithm", GUIDED)
-def test_same_seed_same_bits_and_guidance_makes_a_difference(algorithm):
+def test_same_seed_gives_the_same_bits_and_guidance_other_actions(algorithm):
     settings = {"alpha_low": 0.9, "action_noise": Constant(0.0)}
     one, same = (build(algorithm, **settings).learn(150) for _ in range(2))
     assert_same_to_the_bit(one, same)
@@ -89,7 +90,7 @@ def test_same_seed_same_bits_and_guidance_makes_a_difference(algorithm):
 
 
 class KeepsLast(VecNormalize):
-    """Leaves the raw last observation in info, for a base that shall store it."""
+    """Puts the raw last observation of an episode into info, for a base that stores it."""
 
     def step_wait(self):
         step_wait, lasts = self.venv.step_wait, {}
@@ -117,9 +118,7 @@ class StoresLast(ReplayBuffer):
         super().add(obs, next_obs, action, reward, done, infos)
 
 
-def test_unguided_under_vec_normalize_it_equals_a_base_that_stores_raw_last_observations():
-    from test_exploration import assert_same_to_the_bit
-
+def test_unguided_model_under_vec_normalize_equals_a_base_that_stores_raw_last_observations():
     base = build(stable_baselines3.SAC, KeepsLast(DummyVecEnv([Line])), replay_buffer_class=StoresLast).learn(150)
     unguided = build(SACAP, VecNormalize(DummyVecEnv([Line])), alpha=0.0).learn(150)
     assert_same_to_the_bit(base, unguided)

@@ -1,3 +1,5 @@
+"""Replay buffers that feed K: which transitions and labels they store, and how they are loaded."""
+
 import copy
 import io
 import pickle
@@ -52,7 +54,7 @@ def k_rows(knowledge):
 
 
 def r_rows(buffer, n):
-    """The first n transitions of R as :func:`k_rows` writes them, labelled by the oracle |x'| <= |x|."""
+    """The first n transitions of R as :func:`k_rows` writes them, labelled by |x'| <= |x|."""
     keyed = buffer.observations if isinstance(buffer.observations, dict) else {"": buffer.observations}
     next_keyed = (
         buffer.next_observations if isinstance(buffer.next_observations, dict) else {"": buffer.next_observations}
@@ -76,7 +78,7 @@ def test_r_and_k_hold_the_same_transitions(kind, settings, buffer_class, n_envs)
     assert type(buffer) is buffer_class
     assert k_rows(buffer.knowledge) == r_rows(buffer, 40)
     assert buffer.knowledge.seen == list(np.bincount([row[-1] for row in k_rows(buffer.knowledge)], minlength=2))
-    # What reached the environments is what was stored.
+    # The environments executed what was stored.
     for i, inner in enumerate(env.envs):
         np.testing.assert_allclose(np.array(inner.executed), buffer.actions[:40, i], atol=1e-6)
 
@@ -89,12 +91,12 @@ def test_labels_use_the_last_observation_of_an_episode_not_the_reset():
         return towards_centre(obs, actions, next_obs)
 
     build(DDPGAP, Line(horizon=4, labels=False), ap_function=remember).learn(8)
-    # Column 1 is time: the step that ends an episode leads to 1, not to the 0 after the automatic reset.
+    # Entry 1 is time: the step that ends an episode leads to 1, not to the 0 after the automatic reset.
     np.testing.assert_allclose(seen, [(0, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1)] * 2)
 
 
 @pytest.mark.parametrize("kind", ["array", "dict"])
-def test_with_vec_normalize_the_ap_function_sees_raw_observations_and_env_actions(kind):
+def test_ap_function_gets_raw_observations_and_actions_in_env_units_under_vec_normalize(kind):
     calls = []
 
     def remember(obs, actions, next_obs):
@@ -119,12 +121,12 @@ def test_with_vec_normalize_the_ap_function_sees_raw_observations_and_env_action
     assert {row[1 if kind == "array" else 0] for row in rows} == {0, 0.25, 0.5, 0.75}  # K keeps raw times
 
 
-def test_the_ap_function_wins_over_the_label_of_the_environment():
+def test_ap_function_takes_precedence_over_labels_in_info():
     model = build(DDPGAP, Line(), ap_function=lambda obs, actions, next_obs: np.ones(len(actions), bool)).learn(20)
     assert model.replay_buffer.knowledge.seen == [0, 20]
 
 
-def test_a_failing_ap_function_leaves_both_buffers_untouched():
+def test_failing_ap_function_leaves_both_buffers_unchanged():
     model = build(DDPGAP, Line(), ap_function=lambda obs, actions, next_obs: "no")
     with pytest.raises(TypeError, match="must return bool"):
         model.learn(5)
@@ -133,7 +135,7 @@ def test_a_failing_ap_function_leaves_both_buffers_untouched():
 
 @pytest.mark.filterwarnings("ignore:`ap_function` .* cannot be pickled")
 @pytest.mark.parametrize(("kind", "settings", "buffer_class"), VARIANTS)
-def test_pickling_leaves_the_ap_function_out_and_keeps_k(kind, settings, buffer_class):
+def test_pickled_buffer_omits_the_ap_function_and_keeps_k(kind, settings, buffer_class):
     class Unpicklable:
         def __call__(self, obs, actions, next_obs):
             return np.ones(len(actions), bool)
@@ -149,7 +151,7 @@ def test_pickling_leaves_the_ap_function_out_and_keeps_k(kind, settings, buffer_
     assert len(restored.knowledge) == 25
 
 
-def test_loading_a_replay_buffer_gives_it_the_ap_function_of_the_model():
+def test_loaded_replay_buffer_gets_the_ap_function_of_the_model():
     model = build(DDPGAP, Line(labels=False), ap_function=towards_centre).learn(10)
     file = io.BytesIO()
     model.save_replay_buffer(file)
@@ -169,7 +171,7 @@ def test_loading_a_plain_replay_buffer_is_refused_and_changes_nothing():
     assert model.replay_buffer is own
 
 
-def test_knowledge_is_required():
+def test_buffer_requires_a_knowledge_buffer():
     with pytest.raises(TypeError, match="PermissibilityReplayBuffer needs `knowledge=KnowledgeBuffer"):
         PermissibilityReplayBuffer(10, spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (1,)))
 
@@ -198,12 +200,12 @@ class Mine(KnowledgeMixin, ReplayBuffer):
         (Mine, BOX, 1, Mine),
     ],
 )
-def test_guided_buffer_class(requested, space, n_steps, expected):
+def test_requested_buffer_class_maps_to_its_permissibility_variant(requested, space, n_steps, expected):
     assert guided_buffer_class(requested, space, n_steps) is expected
 
 
 @pytest.mark.parametrize("requested", [RolloutBuffer, type("Foreign", (ReplayBuffer,), {})])
-def test_a_buffer_that_does_not_feed_k_is_refused(requested):
+def test_buffer_class_that_does_not_feed_k_is_refused(requested):
     name = requested.__name__
     with pytest.raises(
         ValueError, match=rf"`replay_buffer_class` = {name} does not feed.*class Mine\(KnowledgeMixin, {name}"
@@ -220,12 +222,12 @@ def test_n_steps_cannot_be_combined_with_one_step_buffers(requested, space, name
         guided_buffer_class(requested, space, 3)
 
 
-def test_n_step_returns_are_set_up_as_sb3_does():
+def test_n_step_buffer_gets_n_steps_and_gamma_of_the_model():
     buffer = build(DDPGAP, n_steps=3, gamma=0.8).replay_buffer
     assert (buffer.n_steps, buffer.gamma) == (3, 0.8)
 
 
-def test_own_buffer_class_gets_knowledge():
+def test_custom_buffer_class_gets_a_knowledge_buffer():
     model = build(DDPGAP, replay_buffer_class=Mine).learn(15)
     assert type(model.replay_buffer) is Mine
     assert isinstance(model.replay_buffer.knowledge, KnowledgeBuffer)
@@ -233,7 +235,7 @@ def test_own_buffer_class_gets_knowledge():
 
 
 @pytest.mark.parametrize("algorithm", [SACAP, DQNAP])
-def test_functions_that_work_in_place_change_nothing_that_is_stored_or_executed(algorithm):
+def test_functions_that_modify_their_arguments_change_neither_buffers_nor_actions(algorithm):
     def label(obs, actions, next_obs):
         good = towards_centre(obs, actions, next_obs)
         for array in (obs, actions, next_obs):
@@ -254,7 +256,7 @@ def test_functions_that_work_in_place_change_nothing_that_is_stored_or_executed(
     np.testing.assert_array_equal(model.replay_buffer.actions, plain.replay_buffer.actions)
 
 
-def test_a_copied_model_goes_on_with_its_ap_function():
+def test_copied_model_keeps_its_ap_function():
     model = build(DDPGAP, Line(labels=False), ap_function=towards_centre).learn(20)
     copied = copy.deepcopy(model).learn(20)
     assert len(copied.replay_buffer.knowledge) == 40
@@ -268,7 +270,7 @@ def test_a_copied_model_goes_on_with_its_ap_function():
         ({"n_steps": 3}, {"n_steps": 3, "gamma": 0.5}, "with gamma = 0.99, but this model's has 0.5"),
     ],
 )
-def test_loading_a_buffer_of_other_returns_is_refused(saved, own, message):
+def test_loading_a_buffer_with_other_n_step_returns_is_refused(saved, own, message):
     file = io.BytesIO()
     build(DDPGAP, **saved).learn(20).save_replay_buffer(file)
     file.seek(0)
@@ -293,7 +295,7 @@ def test_loading_a_buffer_without_hindsight_is_refused():
         (lambda: gym.wrappers.FlattenObservation(Line("dict", n_actions=None)), None),
     ],
 )
-def test_a_replay_buffer_of_another_environment_is_refused_at_load(other, message):
+def test_loading_a_buffer_of_another_environment_is_refused(other, message):
     file = io.BytesIO()
     build(DDPGAP, other()).learn(20).save_replay_buffer(file)
     file.seek(0)

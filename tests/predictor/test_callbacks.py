@@ -1,3 +1,5 @@
+"""When the predictor is fitted and validated, how that controls alpha, and which metrics are logged."""
+
 import warnings
 from itertools import pairwise
 from unittest.mock import Mock
@@ -15,7 +17,7 @@ from sb3_sap.predictor.knowledge import LabelledActions
 
 
 class Recorder(PermissibilityCallback):
-    """Fits and validates nothing, but remembers when it would have."""
+    """Records when it would have fitted and validated."""
 
     def __init__(self):
         super().__init__()
@@ -38,7 +40,7 @@ class NoCallback(BaseCallback):
     ("settings", "n_envs", "expected"),
     [
         ({"train_freq": 1}, 1, [8, 9, 10, 11, 12]),
-        # As often as the base trains,
+        # As often as the base algorithm trains,
         ({"train_freq": 4}, 1, [8, 12]),
         ({"train_freq": 4, "gradient_steps": 2}, 1, [8, 8, 12, 12]),
         ({"train_freq": 4, "gradient_steps": 9}, 1, [8] * 4 + [12] * 4),
@@ -53,21 +55,21 @@ class NoCallback(BaseCallback):
         # which is a vectorised step, after which two transitions are new.
         ({"train_freq": 2, "predictor_gradient_steps": -1}, 2, [8] * 2 + [12] * 2),
         ({"train_freq": 1}, 2, [8, 10, 12]),
-        # A base that never trains leaves E its own fits.
+        # If the base algorithm never trains, the predictor is still fitted.
         ({"train_freq": 1, "gradient_steps": 0}, 1, [8, 9, 10, 11, 12]),
     ],
 )
-def test_fits_follow_the_steps_collected(settings, n_envs, expected):
+def test_fits_after_each_rollout_are_as_many_as_the_settings_say(settings, n_envs, expected):
     callback = Recorder()
     env = DummyVecEnv([lambda: Line(horizon=5)] * n_envs)
     model = build(DDPGAP, env, seed=1, min_per_class=1, **{"gradient_steps": 1} | settings)
-    # The first two labels of each class may come late: give K one of each before the run.
+    # The first labels of a class may come late: K gets some of each before the run.
     knowledge = model.replay_buffer.knowledge
     while min(knowledge.counts("train") + knowledge.counts("validation")) == 0:
         knowledge.add(np.zeros((2, 2)), np.zeros((2, 1)), np.array([True, False]))
     first = expected[0]
     model.learn(12, callback=callback)
-    # From the first rollout on; `expected` begins where the cases are easiest to tell apart.
+    # Fits begin with the first rollout; `expected` begins where the cases differ most.
     assert [step for step in callback.fits if step >= first] == expected
     assert callback.validations == sorted(set(callback.fits))
 
@@ -82,21 +84,21 @@ def test_fits_follow_the_steps_collected(settings, n_envs, expected):
         ),  # 4 up to step 4, then 4·(1 + ln(t/4)): 5 at 5.1, 6 at 6.6, 7 at 8.5, 8 at 10.9
     ],
 )
-def test_fits_become_rarer_as_steps_grow(growth, steps):
+def test_refit_growth_gives_a_geometric_schedule(growth, steps):
     model = build(DDPGAP, refit_growth=growth)
     assert [now for now in range(1, 13) if model.refits_due(now - 1, now)] == steps
     assert model.refits_due(0, 12) == len(steps)
 
 
-def test_an_e_that_teaches_in_its_own_rhythm_is_never_old():
+def test_geometric_schedule_has_a_maximum_gap_if_the_auxiliary_loss_has_its_own_schedule():
     model = build(DDPGAP, refit_growth=0.1, teaching_growth=0.0)
     fits = [now for now in range(1, 1001) if model.refits_due(now - 1, now)]
     assert fits[:11] == [*range(1, 11), 12]
-    # A tenth of 150 steps is the limit of 15; without it they would be 100 apart in the end.
+    # A tenth of 150 steps is the maximum gap of 15; without it the last gap would be 100.
     assert {later - fit for fit, later in pairwise(fits) if fit > 150} == {15}
 
 
-def test_the_callback_asks_how_many_fits_are_due():
+def test_callback_fits_as_often_as_refits_are_due():
     callback = Recorder()
     env = DummyVecEnv([lambda: Line(horizon=5)] * 2)
     model = build(DDPGAP, env, refit_growth=0.1, min_per_class=1).learn(200, callback=callback)
@@ -105,7 +107,7 @@ def test_the_callback_asks_how_many_fits_are_due():
     assert set(callback.validations) <= set(callback.fits)
 
 
-def test_after_guidance_every_fifth_fit_is_left_and_the_actor_does_not_notice(monkeypatch):
+def test_after_guidance_the_predictor_is_fitted_every_fifth_time_without_effect_on_the_actor(monkeypatch):
     callback = Recorder()
     build(DDPGAP, guidance_end=30, min_per_class=1).learn(60, callback=callback)
     assert [step for step in callback.fits if step >= 30] == [30, 35, 40, 45, 50, 55, 60]
@@ -117,20 +119,20 @@ def test_after_guidance_every_fifth_fit_is_left_and_the_actor_does_not_notice(mo
     assert all(map(th.equal, rarely.actor.parameters(), often.actor.parameters()))
 
 
-def test_after_guidance_e_is_fitted_as_before_where_it_goes_on_teaching():
+def test_after_guidance_fits_continue_if_the_auxiliary_loss_has_its_own_schedule():
     callback = Recorder()
     settings = {"actor_permissibility_coef": 1.0, "teaching_growth": 0.0}
     build(DDPGAP, guidance_end=30, min_per_class=1, **settings).learn(60, callback=callback)
     assert [step for step in callback.fits if step >= 30] == list(range(30, 61))
 
 
-def test_fits_become_rarer_over_the_whole_life():
+def test_geometric_schedule_counts_the_steps_of_all_learns():
     model, callback = build(DDPGAP, refit_growth=0.1, min_per_class=1), Recorder()
     model.learn(100).learn(100, callback=callback)
     assert len(callback.fits) == model.refits_due(100, 200) == 6  # 10·ln 2 is 6.9
 
 
-def test_nothing_is_fitted_before_each_class_has_its_minimum():
+def test_predictor_is_not_fitted_before_each_class_has_its_minimum():
     callback = Recorder()
     labels = iter([True] * 10 + [False] * 30)
 
@@ -143,7 +145,7 @@ def test_nothing_is_fitted_before_each_class_has_its_minimum():
     assert callback.fits == list(range(15, 41))
 
 
-def test_fit_draws_a_balanced_sample_of_the_training_part(monkeypatch):
+def test_fit_and_validation_use_balanced_samples_of_disjoint_parts(monkeypatch):
     drawn = []
     model = build(DDPGAP, dataset_size=30, validation_size=14)
     monkeypatch.setattr(model.predictor, "fit", lambda data: drawn.append(data) or 0.5)
@@ -164,13 +166,13 @@ def test_fit_draws_a_balanced_sample_of_the_training_part(monkeypatch):
         ((0.699, 0.699), 0.9, 0.5, 0.5),
         ((0.7, 0.7), 0.9, 0.5, 0.9),
         ((0.5, 1.0), 0.9, 0.5, 0.9),
-        ((0.0, 1.0), 0.3, 0.5, 0.3),  # a low α is never raised
+        ((0.0, 1.0), 0.3, 0.5, 0.3),  # an α below alpha_low is never raised
         ((1.0, 1.0), 0.3, 0.5, 0.3),
         ((1.0, 1.0), 0.0, 0.5, 0.0),
         (None, 0.9, 0.5, 0.5),  # before the first validation
     ],
 )
-def test_alpha_gate(accuracies, alpha, alpha_low, expected):
+def test_alpha_is_lowered_while_the_validation_accuracy_is_below_the_threshold(accuracies, alpha, alpha_low, expected):
     model = build(DDPGAP, alpha=alpha, alpha_low=alpha_low)
     if accuracies is not None:
         model.predictor.recall = lambda data: accuracies
@@ -205,7 +207,7 @@ def default_fits(monkeypatch):
     ],
     ids=["none", "callback", "list", "function", "CallbackList", "EventCallback"],
 )
-def test_the_model_installs_the_callback_by_itself(given, algorithm, monkeypatch):
+def test_model_installs_the_callback_in_every_learn(given, algorithm, monkeypatch):
     fits = default_fits(monkeypatch)
     build(algorithm).learn(100, callback=given)
     assert fits[-10:] == list(range(91, 101))
@@ -223,21 +225,21 @@ def test_the_model_installs_the_callback_by_itself(given, algorithm, monkeypatch
     ],
     ids=["itself", "list", "CallbackList", "nested"],
 )
-def test_one_of_the_users_own_takes_the_place_of_the_default(wrap, progress_bar, monkeypatch):
+def test_callback_of_the_user_replaces_the_default(wrap, progress_bar, monkeypatch):
     fits, callback = default_fits(monkeypatch), Recorder()
     build(DDPGAP).learn(30, callback=wrap(callback), progress_bar=progress_bar)
     assert fits == []
     assert callback.fits[-10:] == list(range(21, 31))
 
 
-def test_a_subclass_may_use_the_step_hook_for_itself():
+def test_subclass_of_the_callback_can_override_on_step():
     class Mine(Recorder):
         def _on_step(self):
             return self.num_timesteps < 30
 
     callback = Mine()
     assert build(DDPGAP).learn(100, callback=callback).num_timesteps == 30
-    assert callback.fits[-9:] == list(range(21, 30))  # SB3 ends no rollout that a callback stops
+    assert callback.fits[-9:] == list(range(21, 30))  # SB3 does not end a rollout that a callback stops
 
 
 @pytest.mark.parametrize(
@@ -250,8 +252,8 @@ def test_a_subclass_may_use_the_step_hook_for_itself():
     ],
     ids=["EveryNTimesteps", "after_eval", "on_new_best", "list in after_eval"],
 )
-def test_inside_an_event_it_would_never_train_and_is_refused(wrap):
-    # SB3's event callbacks do not tell their children that a rollout has ended.
+def test_callback_inside_an_event_callback_is_refused(wrap):
+    # SB3's event callbacks do not pass the end of a rollout on to their children.
     with pytest.raises(ValueError, match=r"inside (EveryNTimesteps|EvalCallback) would never train.*learn\(callback="):
         build(DDPGAP).learn(30, callback=wrap(Recorder()))
 

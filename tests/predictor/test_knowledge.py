@@ -1,3 +1,5 @@
+"""The knowledge buffer K: replacement, balanced samples, the validation part, and pickling."""
+
 import pickle
 from collections import Counter
 
@@ -15,7 +17,7 @@ BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
 
 def add(knowledge, numbers, labels):
-    """Adds tuples that can be told apart: number i has observation (i, -i) and action i / 1000."""
+    """Adds distinct tuples: number i has observation (i, -i) and action i / 1000."""
     numbers = np.asarray(numbers, dtype=np.float32)
     obs = np.stack([numbers, -numbers], axis=1)
     knowledge.add(obs, numbers[:, None] / 1000, np.asarray(labels, dtype=bool))
@@ -35,7 +37,7 @@ def stored(knowledge, part):
 
 
 class Oracle:
-    """Section 4.2 said with a list: when full, a tuple replaces the oldest of its class, if too few of the other."""
+    """Section 4.2 as a list: if full, a tuple replaces the oldest of its class, or of the other if its own is rare."""
 
     def __init__(self, capacity, least):
         self.capacity, self.least, self.rows = capacity, min(least, capacity // 2), []
@@ -49,7 +51,7 @@ class Oracle:
 
 
 class ScriptedRng:
-    """Sends tuples to the parts that the test chose."""
+    """Sends tuples to the parts that the test chooses."""
 
     def __init__(self, knowledge, validation):
         self.draws = iter(0.0 if v else 0.99 for v in validation)
@@ -59,7 +61,7 @@ class ScriptedRng:
         return next(self.draws)
 
 
-# Labels one by one, and in runs of one class alone, which fill a part before the other class comes.
+# Single labels, and long runs of one class, which fill a part before the other class occurs.
 LABELS = st.one_of(
     st.lists(st.booleans(), max_size=90),
     st.lists(st.tuples(st.booleans(), st.integers(1, 30)), max_size=5).map(
@@ -76,7 +78,7 @@ LABELS = st.one_of(
     labels=LABELS,
     random=st.randoms(),
 )
-def test_eviction_equals_the_oracle(size, fraction, least, labels, random):
+def test_replacement_follows_section_4_2(size, fraction, least, labels, random):
     to_validation = [random.random() < fraction for _ in labels]
     knowledge = KnowledgeBuffer(BOX, 1, size, fraction, 0, least)
     n_validation = round(size * fraction)
@@ -93,7 +95,7 @@ def test_eviction_equals_the_oracle(size, fraction, least, labels, random):
     assert knowledge.seen == [labels.count(False), labels.count(True)]
 
 
-def test_a_full_part_keeps_its_balance():
+def test_full_part_keeps_its_balance():
     knowledge = KnowledgeBuffer(BOX, 1, 10, 0.5)
     ScriptedRng(knowledge, [False] * 100)
     add(knowledge, [0, 1], [False, False])
@@ -101,7 +103,7 @@ def test_a_full_part_keeps_its_balance():
     assert stored(knowledge, "train") == [(0, 0), (1, 0), (97, 1), (98, 1), (99, 1)]
 
 
-def test_an_absent_class_takes_the_place_of_the_oldest_of_the_other():
+def test_absent_class_replaces_the_oldest_tuple_of_the_other_class():
     knowledge = KnowledgeBuffer(BOX, 1, 10, 0.5)
     ScriptedRng(knowledge, [False] * 10)
     add(knowledge, range(8), [True] * 8)  # 3 to 7 remain
@@ -111,7 +113,7 @@ def test_an_absent_class_takes_the_place_of_the_oldest_of_the_other():
     assert stored(knowledge, "train") == [(5, 1), (6, 1), (7, 1), (8, 0), (9, 1)]
 
 
-def test_a_class_that_was_rare_when_the_store_filled_grows():
+def test_class_that_was_absent_when_the_part_filled_grows_to_its_minimum():
     knowledge = KnowledgeBuffer(BOX, 1, 20, 0.5, min_per_class=3)
     ScriptedRng(knowledge, [False] * 20)
     add(knowledge, range(15), [True] * 15)
@@ -119,7 +121,7 @@ def test_a_class_that_was_rare_when_the_store_filled_grows():
     assert [number for number, label in stored(knowledge, "train") if label == 0] == [17, 18, 19]
 
 
-def test_samples_are_balanced_however_skewed_the_store_is():
+def test_samples_of_skewed_knowledge_are_balanced():
     knowledge = KnowledgeBuffer(BOX, 1, 1000, 0.5, seed=0)
     ScriptedRng(knowledge, [False] * 200)
     add(knowledge, range(200), [i % 100 == 7 for i in range(200)])  # 7 and 107 are permissible
@@ -136,7 +138,7 @@ def test_samples_are_balanced_however_skewed_the_store_is():
     assert (sample.observations.dtype, sample.actions.dtype, sample.labels.dtype) == (np.float32,) * 3
 
 
-def test_every_stored_tuple_is_drawn_alike():
+def test_every_stored_tuple_is_equally_likely_to_be_sampled():
     knowledge = KnowledgeBuffer(BOX, 1, 20, 0.5)
     ScriptedRng(knowledge, [False] * 10)
     add(knowledge, range(10), [False] * 5 + [True] * 5)
@@ -146,7 +148,7 @@ def test_every_stored_tuple_is_drawn_alike():
     assert all(abs(times - 1000) < 150 for times in drawn.values())  # 5 standard deviations
 
 
-def test_validation_examples_are_never_trained_on():
+def test_training_and_validation_samples_are_disjoint():
     knowledge = KnowledgeBuffer(BOX, 1, 400, 0.25, seed=3)
     add(knowledge, range(600), [i % 2 == 0 for i in range(600)])
     parts = [{number for number, _ in stored(knowledge, part)} for part in ("train", "validation")]
@@ -155,7 +157,7 @@ def test_validation_examples_are_never_trained_on():
     assert set(knowledge.sample(2000, "validation").observations[:, 0]) <= parts[1]
 
 
-def test_split_is_nine_to_one_in_size_and_in_share():
+def test_validation_part_has_a_tenth_of_the_size_and_of_the_tuples():
     knowledge = KnowledgeBuffer(BOX, 1, 10_000, seed=0)
     assert {part: slots.capacity for part, slots in knowledge.parts.items()} == {"train": 9000, "validation": 1000}
     add(knowledge, range(5000), [True] * 5000)
@@ -163,7 +165,7 @@ def test_split_is_nine_to_one_in_size_and_in_share():
     assert len(knowledge) == 5000
 
 
-def test_observations_are_kept_raw_and_normalised_when_sampled():
+def test_observations_are_stored_raw_and_normalised_when_sampled():
     env = VecNormalize(DummyVecEnv([Line]), clip_obs=1000)
     env.obs_rms.mean, env.obs_rms.var = np.array([10.0, 0.0]), np.array([4.0, 1.0])
     knowledge = KnowledgeBuffer(BOX, 1, 20, 0.5)
@@ -173,12 +175,12 @@ def test_observations_are_kept_raw_and_normalised_when_sampled():
     sample = knowledge.sample(10, env=env)
     expected = np.where(sample.labels == 1, 2.0, -2.0)  # (14 - 10) / 2, (6 - 10) / 2
     np.testing.assert_allclose(sample.observations[:, 0], expected, rtol=1e-5)
-    env.obs_rms.mean = np.array([14.0, 0.0])  # the statistics of today, not those of the day it was stored
+    env.obs_rms.mean = np.array([14.0, 0.0])  # the present statistics count, not those at the time of storing
     assert set(knowledge.sample(10, env=env).observations[:, 0].round(3)) == {0.0, -4.0}
     assert set(knowledge.sample(10).observations[:, 0]) == {14.0, 6.0}
 
 
-def test_dict_observations_come_back_by_key():
+def test_dict_observations_are_sampled_by_key():
     number = spaces.Box(-np.inf, np.inf, (1,), np.float32)
     knowledge = KnowledgeBuffer(spaces.Dict({"a": number, "b": number}), 2, 20, 0.5, seed=0)
     ScriptedRng(knowledge, [False] * 2)
@@ -191,7 +193,7 @@ def test_dict_observations_come_back_by_key():
     np.testing.assert_allclose(sample.actions[sample.labels == 0], [[0.3, 0.4]] * 2, rtol=1e-6)
 
 
-def test_images_stay_bytes():
+def test_images_are_stored_as_uint8():
     knowledge = KnowledgeBuffer(spaces.Box(0, 255, (3, 4, 4), np.uint8), 1, 20, 0.5)
     assert knowledge.observations[""].dtype == np.uint8
     assert knowledge.observations[""].shape == (20, 3, 4, 4)
@@ -203,7 +205,7 @@ def filled(seed):
     return knowledge
 
 
-def test_the_seed_fixes_split_and_samples():
+def test_seed_determines_split_and_samples():
     one, same, other = filled(5), filled(5), filled(6)
     assert stored(one, "validation") == stored(same, "validation") != stored(other, "validation")
     for _ in range(2):
@@ -213,19 +215,19 @@ def test_the_seed_fixes_split_and_samples():
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 1.5])
-def test_validation_fraction_must_be_a_fraction(fraction):
+def test_validation_fraction_must_lie_between_0_and_1(fraction):
     with pytest.raises(ValueError, match=rf"`validation_fraction` must lie between 0 and 1, but is {fraction}"):
         KnowledgeBuffer(BOX, 1, 100, fraction)
 
 
 @pytest.mark.parametrize(("size", "fraction"), [(0, 0.1), (-5, 0.1), (14, 0.1), (14, 0.9)])
-def test_each_part_needs_room_for_both_classes(size, fraction):
+def test_parts_without_room_for_both_classes_are_refused(size, fraction):
     with pytest.raises(ValueError, match=rf"`knowledge_buffer_size` = {size} with `validation_fraction` = {fraction}"):
         KnowledgeBuffer(BOX, 1, size, fraction)
     KnowledgeBuffer(BOX, 1, 16, fraction)  # round(1.6) = 2
 
 
-def test_an_unbalanced_sample_follows_the_labels():
+def test_unbalanced_sample_has_the_proportions_of_the_labels():
     knowledge = KnowledgeBuffer(spaces.Box(-1, 1, (1,)), 1, 1000, seed=0)
     labels = np.arange(800) % 4 == 0  # a quarter is permissible
     knowledge.add(np.zeros((800, 1)), labels[:, None], labels)
@@ -241,7 +243,7 @@ def circle(n):
     return np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
 
 
-def test_a_typical_observation_is_one_that_was_seen():
+def test_typical_observation_is_one_of_those_stored():
     k = KnowledgeBuffer(spaces.Box(-1, 1, (2,)), 1, 3_000, seed=0)
     assert k.typical_observation() is None
     k.add(circle(100), np.zeros((100, 1)), np.arange(100) % 2 == 0)
@@ -253,7 +255,7 @@ def test_a_typical_observation_is_one_that_was_seen():
 
 
 @pytest.mark.parametrize("n", [0, 3, 40, 200])
-def test_pickling_writes_only_what_is_filled(n):
+def test_pickle_holds_only_filled_slots_and_restores_the_buffer(n):
     images = spaces.Box(0, 255, (20, 20, 3), np.uint8)
     k = KnowledgeBuffer(spaces.Dict(image=images, v=spaces.Box(-1, 1, (1,))), 1, 100, seed=0)
     rng = np.random.default_rng(0)
@@ -267,7 +269,7 @@ def test_pickling_writes_only_what_is_filled(n):
         assert restored.observations[key].dtype == store.dtype
     np.testing.assert_array_equal(restored.actions, k.actions)
     assert restored.counts("train") == k.counts("train")
-    # and both go on alike
+    # Both continue in the same way.
     more = {"image": rng.integers(0, 256, (30, 20, 20, 3), np.uint8), "v": rng.random((30, 1))}
     actions, labels = rng.random((30, 1)), rng.random(30) < 0.5
     for one in (k, restored):

@@ -1,3 +1,5 @@
+"""The predictor E: one step computed by hand, what it learns, its optimizers and its layers."""
+
 import numpy as np
 import pytest
 import torch as th
@@ -21,7 +23,7 @@ def dataset(obs, actions, labels):
     return LabelledActions(np.float32(obs), np.float32(actions), np.float32(labels))
 
 
-def test_one_sgd_step_is_equation_7_by_hand():
+def test_sgd_step_follows_equation_7():
     # Without hidden layers E is σ(w·x + b) and, from zero weights, σ = 1/2: the gradient of the mean cross-entropy
     # is the mean of (1/2 - label)·x.
     e = predictor(net_arch=[], learning_rate=1.0, weight_decay=0.5, optimizer_class="SGD")
@@ -35,7 +37,7 @@ def test_one_sgd_step_is_equation_7_by_hand():
     assert e.head[0].bias.item() == pytest.approx(0)
 
 
-def test_the_step_adds_lambda_theta_to_the_gradient_of_the_cross_entropy():
+def test_weight_decay_adds_lambda_theta_to_the_gradient_of_the_cross_entropy():
     rate, decay = 0.1, 0.3
     e = predictor(net_arch=[4], learning_rate=rate, weight_decay=decay, optimizer_class="SGD")
     before = [p.detach().clone() for p in e.parameters()]
@@ -70,7 +72,7 @@ def threshold_data(rng, n):
 
 
 @pytest.mark.parametrize("settings", [{}, {"optimizer_class": "SGD", "learning_rate": 0.1}])
-def test_learns_a_threshold_that_depends_on_the_state(settings):
+def test_predictor_learns_a_threshold_that_depends_on_the_state(settings):
     rng = np.random.default_rng(0)
     e = predictor(net_arch=[32], **settings)
     unseen = threshold_data(rng, 500)
@@ -80,7 +82,7 @@ def test_learns_a_threshold_that_depends_on_the_state(settings):
     assert min(e.recall(unseen)) > 0.97
 
 
-def test_recall_by_hand():
+def test_recall_is_the_accuracy_within_each_class():
     e = predictor(net_arch=[])
     with th.no_grad():  # logit = action: permissible above zero
         e.head[0].weight.copy_(th.tensor([[0.0, 0.0, 1.0]]))
@@ -91,13 +93,13 @@ def test_recall_by_hand():
     assert e.recall(dataset(np.zeros((5, 2)), actions[:5], labels[:5])) == (pytest.approx(1 / 2), pytest.approx(2 / 3))
 
 
-def test_the_paper_network_is_the_default():
+def test_default_network_is_that_of_the_paper():
     shapes = [tuple(layer.weight.shape) for layer in predictor().head if isinstance(layer, nn.Linear)]
     assert shapes == [(128, 3), (256, 128), (1, 256)]
 
 
 @pytest.mark.parametrize("name", ["SGD", "Adam", "AdamW", "RMSprop"])
-def test_optimizers_by_name_and_class(name):
+def test_optimizers_are_given_by_name_or_class(name):
     for given in (name, getattr(th.optim, name)):
         optimizer = predictor(optimizer_class=given, learning_rate=0.01, weight_decay=0.02).optimizer
         assert type(optimizer) is getattr(th.optim, name)
@@ -105,18 +107,18 @@ def test_optimizers_by_name_and_class(name):
         assert (group["lr"], group["weight_decay"]) == (0.01, 0.02)
 
 
-def test_optimizer_kwargs_are_passed_on():
+def test_optimizer_kwargs_reach_the_optimizer():
     e = predictor(optimizer_class="SGD", optimizer_kwargs={"momentum": 0.9})
     assert e.optimizer.param_groups[0]["momentum"] == 0.9
 
 
 @pytest.mark.parametrize("name", ["Adamm", "sgd", "lr_scheduler", "Tensor"])
-def test_unknown_optimizers_are_named(name):
+def test_unknown_optimizers_are_refused(name):
     with pytest.raises(ValueError, match=rf"`optimizer_class` = '{name}' names no optimizer of torch.optim"):
         predictor(optimizer_class=name)
 
 
-def test_dict_observations():
+def test_dict_observations_are_concatenated_with_the_action():
     space = spaces.Dict({"a": spaces.Box(-1, 1, (1,)), "b": spaces.Box(-1, 1, (2,))})
     e = PermissibilityPredictor(space, ACTIONS, net_arch=[8], batch_size=2, features_extractor_class=CombinedExtractor)
     obs = {"a": np.float32([[0.1], [0.2], [0.3]]), "b": np.float32([[1, 2], [3, 4], [5, 6]])}
@@ -128,7 +130,7 @@ def test_dict_observations():
     assert int(e.n_updates) == 2
 
 
-def test_images_are_scaled_and_have_an_extractor_of_their_own_that_learns():
+def test_images_are_scaled_and_the_predictors_own_extractor_learns():
     space = spaces.Box(0, 255, (1, 36, 36), np.uint8)
     e = PermissibilityPredictor(
         space, ACTIONS, net_arch=[8], features_extractor_class=NatureCNN, features_extractor_kwargs={"features_dim": 4}
@@ -141,7 +143,7 @@ def test_images_are_scaled_and_have_an_extractor_of_their_own_that_learns():
     assert not th.equal(before, e.features_extractor.cnn[0].weight)
 
 
-def test_a_saved_state_knows_that_it_was_fitted():
+def test_loaded_state_is_marked_as_fitted():
     e, fresh = predictor(net_arch=[4]), predictor(net_arch=[4])
     e.fit(dataset([[0, 0]], [[0]], [1]))
     assert not fresh.fitted
@@ -150,7 +152,7 @@ def test_a_saved_state_knows_that_it_was_fitted():
 
 
 class Normalising(BaseFeaturesExtractor):
-    """Its layers do one thing while training and another afterwards."""
+    """Layers that act differently in training and in evaluation."""
 
     def __init__(self, space, layer):
         super().__init__(space, 2)
@@ -172,7 +174,7 @@ def with_layer(layer, **settings):
 EXAMPLES = dataset([[10, 1], [12, 3], [14, 5], [16, 7], [18, 9]], np.zeros((5, 1)), [0, 1, 0, 1, 0])
 
 
-def test_batch_norm_takes_statistics_from_fits_alone():
+def test_batch_norm_statistics_change_in_fits_only():
     e = with_layer("batch norm", batch_size=4, learning_rate=0.0)
     e.fit(EXAMPLES)  # in one batch: the last row has no variance of its own
     mean = th.tensor([14.0, 5.0])
@@ -185,7 +187,7 @@ def test_batch_norm_takes_statistics_from_fits_alone():
     assert not e.training
 
 
-def test_dropout_is_drawn_in_fits_alone_and_from_no_global_generator():
+def test_dropout_is_active_in_fits_only_and_leaves_the_global_generator_unchanged():
     before = th.get_rng_state()
     e, same = with_layer("dropout"), with_layer("dropout")
     assert e.fit(EXAMPLES) == same.fit(EXAMPLES)

@@ -1,4 +1,4 @@
-"""E and K by themselves: no algorithm, no replay buffer, no environment."""
+"""E and K without an algorithm, a replay buffer or an environment."""
 
 import subprocess
 import sys
@@ -30,13 +30,13 @@ def fitted_predictor(knowledge, fits=40):
     return predictor
 
 
-def test_the_predictor_learns_from_knowledge_alone():
+def test_predictor_learns_from_a_knowledge_buffer_without_an_algorithm():
     knowledge = knowledge_of(1_000)
     predictor = fitted_predictor(knowledge)
     assert min(predictor.recall(knowledge.sample(200, "validation"))) > 0.9
 
 
-def test_saved_and_loaded_the_predictor_gives_the_same_verdicts_and_keeps_its_settings(tmp_path):
+def test_loaded_predictor_gives_the_same_logits_and_keeps_its_settings(tmp_path):
     predictor = fitted_predictor(knowledge_of(200), fits=3)
     predictor.save(tmp_path / "predictor.pt")
     loaded = PermissibilityPredictor.load(tmp_path / "predictor.pt")
@@ -47,7 +47,7 @@ def test_saved_and_loaded_the_predictor_gives_the_same_verdicts_and_keeps_its_se
     assert loaded.batch_size == predictor.batch_size
 
 
-def test_saved_and_loaded_knowledge_holds_and_draws_the_same(tmp_path):
+def test_loaded_knowledge_buffer_holds_and_samples_the_same(tmp_path):
     knowledge = knowledge_of(200)
     knowledge.save(tmp_path / "knowledge.pkl")
     loaded = KnowledgeBuffer.load(tmp_path / "knowledge.pkl")
@@ -56,7 +56,7 @@ def test_saved_and_loaded_knowledge_holds_and_draws_the_same(tmp_path):
     assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-def test_a_file_of_something_else_is_refused(tmp_path):
+def test_file_without_a_knowledge_buffer_is_refused(tmp_path):
     from stable_baselines3.common.save_util import save_to_pkl
 
     save_to_pkl(tmp_path / "list.pkl", [1, 2])
@@ -64,7 +64,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         KnowledgeBuffer.load(tmp_path / "list.pkl")
 
 
-def test_neither_needs_a_replay_buffer_or_an_algorithm_of_this_package():
+def test_predictor_and_knowledge_buffer_import_neither_replay_buffers_nor_algorithms():
     code = """if True:
         import sys, types
         package = types.ModuleType("sb3_sap")  # without its own imports

@@ -1,4 +1,4 @@
-"""AP functions beyond lane keeping, on transitions computed by hand and on the environments' own dynamics."""
+"""The AP functions of other tasks, on transitions computed by hand and in the environments themselves."""
 
 import gymnasium as gym
 import highway_env  # noqa: F401  registers its environments
@@ -20,7 +20,7 @@ def rows(*values):
 # ------------------------------------------------------------------ mountain cars
 
 
-def test_the_motor_must_not_push_against_the_motion():
+def test_mountain_car_must_not_push_against_the_motion():
     obs = rows([-0.5, 0.02], [-0.5, 0.02], [-0.5, -0.02], [-0.5, -0.02], [-0.5, 0.02])
     expected = [True, False, False, True, False]
     assert tasks.mountain_car_continuous(obs, rows([1.0], [-1.0], [1.0], [-0.2], [0.05]), obs).tolist() == expected
@@ -29,7 +29,7 @@ def test_the_motor_must_not_push_against_the_motion():
     assert tasks.mountain_car(obs, actions[:, None], obs).tolist() == expected
 
 
-def test_where_the_car_turns_either_push_is_permissible():
+def test_mountain_car_may_push_either_way_where_it_turns():
     before, after = rows([-0.9, -0.001]), rows([-0.9, 0.001])
     for push in (-1.0, 1.0):
         assert tasks.mountain_car_continuous(before, rows([push]), after).tolist() == [True]
@@ -38,14 +38,14 @@ def test_where_the_car_turns_either_push_is_permissible():
     assert tasks.mountain_car_continuous(start, rows([1.0]), rows([-0.499, 0.001])).tolist() == [True]
 
 
-def test_idling_delays_the_flag():
+def test_mountain_car_must_not_idle():
     obs = rows([-0.5, 0.02], [-0.5, 0.02], [-0.5, -0.02], [-0.5, 0.0])
     push = rows([0.0], [0.05], [-0.05], [0.0])
     assert tasks.mountain_car_continuous(obs, push, obs).tolist() == [False] * 4
     assert tasks.mountain_car(obs, np.array([1, 1, 1, 1]), obs).tolist() == [False] * 4
 
 
-def test_with_enough_energy_the_car_may_turn_at_once():
+def test_mountain_car_with_enough_energy_may_turn_at_once():
     # Moving left up the left hill, pushing right.
     slow, fast = rows([-0.6, -0.01]), rows([-0.9, -0.04])
     assert flag_within_reach(np.concatenate([slow, fast])).tolist() == [False, True]
@@ -53,7 +53,7 @@ def test_with_enough_energy_the_car_may_turn_at_once():
     assert tasks.mountain_car(fast, np.array([2]), fast).tolist() == [True]
 
 
-def test_within_reach_means_that_pushing_right_gets_there():
+def test_flag_is_within_reach_where_pushing_right_arrives():
     env = gym.make("MountainCar-v0").unwrapped
     rng = np.random.default_rng(0)
     states = np.column_stack([rng.uniform(-1.2, 0.4, 300), rng.uniform(-0.07, 0.07, 300)])
@@ -61,7 +61,7 @@ def test_within_reach_means_that_pushing_right_gets_there():
     for state in states:
         env.reset(seed=0)
         env.state = tuple(state)
-        # A car that turns back to the left has missed it.
+        # A car that turns back to the left does not arrive.
         obs, _, done, _, _ = env.step(2)
         turned = obs[1] > 0
         while not done and not (turned and obs[1] < 0):
@@ -69,14 +69,14 @@ def test_within_reach_means_that_pushing_right_gets_there():
             turned |= obs[1] > 0
         arrives.append(done)
     assert 50 < sum(arrives) < 250
-    # Gymnasium takes steps, not infinitely small ones: at the very edge the sum may err.
+    # Gymnasium takes finite steps, so that the energy may err at the very edge.
     assert np.mean(flag_within_reach(states) == arrives) > 0.97
 
 
 # ------------------------------------------------------------------ acrobot
 
 
-def test_energy_of_the_acrobot():
+def test_acrobot_energy_of_known_states():
     hanging, upright = [1, 0, 1, 0, 0, 0], [-1, 0, 1, 0, 0, 0]
     folded = [1, 0, -1, 0, 0, 0]  # the second link points up again
     assert acrobot_energy(rows(hanging, upright, folded)) == pytest.approx(9.8 * np.array([-2, 2, -1]))
@@ -84,7 +84,7 @@ def test_energy_of_the_acrobot():
     assert acrobot_energy(rows([1, 0, 1, 0, 0, 2])) == pytest.approx([-19.6 + 0.5 + 2.0])
 
 
-def test_energy_of_the_acrobot_is_that_of_the_environment():
+def test_acrobot_energy_is_conserved_by_the_environment_without_torque():
     env = gym.make("Acrobot-v1").unwrapped
     env.reset(seed=0)
     env.state = np.array([1.0, -0.5, 0.8, -1.2])
@@ -92,10 +92,10 @@ def test_energy_of_the_acrobot_is_that_of_the_environment():
     for _ in range(20):
         energies.append(acrobot_energy(env._get_ob()[None])[0])
         env.step(1)
-    assert np.ptp(energies) < 0.05  # without torque it is kept
+    assert np.ptp(energies) < 0.05  # without torque it is conserved
 
 
-def test_the_torque_must_not_brake_its_joint():
+def test_acrobot_must_not_brake_its_joint():
     obs = rows([1, 0, 1, 0, 0, 1.0])
     assert [bool(tasks.acrobot(obs, np.array([a]), obs)[0]) for a in (0, 1, 2)] == [False, False, True]
     turning = rows([1, 0, 1, 0, 0, -1.0])
@@ -107,18 +107,18 @@ def test_the_torque_must_not_brake_its_joint():
 # ------------------------------------------------------------------ pendulum
 
 
-def test_the_pendulum_s_three():
+def test_pendulum_functions_judge_height_torque_and_energy():
     level, higher = rows([0.0, 1.0, -1.0]), rows([0.1, 0.99, -1.0])
     assert tasks.pendulum_height(level, rows([0.0]), higher).tolist() == [True]
     assert tasks.pendulum_height(higher, rows([0.0]), level).tolist() == [False]
     # θ > 0: torque towards the top is negative.
     assert tasks.pendulum_torque(level, rows([-1.0]), level).tolist() == [True]
     assert tasks.pendulum_torque(level, rows([1.0]), level).tolist() == [False]
-    # Falling at 1 rad/s from level there is energy missing: drive on, do not brake.
+    # Falling at 1 rad/s from level, energy is missing: drive on, do not brake.
     falling = rows([0.0, 1.0, 1.0])
     assert tasks.pendulum_energy(falling, rows([1.0]), falling).tolist() == [True]
     assert tasks.pendulum_energy(falling, rows([-1.0]), falling).tolist() == [False]
-    # At 6 rad/s there is too much.
+    # At 6 rad/s there is too much energy.
     racing = rows([0.0, 1.0, 6.0])
     assert tasks.pendulum_energy(racing, rows([1.0]), racing).tolist() == [False]
     assert tasks.pendulum_energy(racing, rows([-1.0]), racing).tolist() == [True]
@@ -132,7 +132,7 @@ def parked(x, y, vx, vy, goal=(0.3, 0.0)):
     return {"achieved_goal": rows([x, y, vx, vy, 1, 0]), "desired_goal": rows([*goal, 0, 0, 0, 1])}
 
 
-def test_parking():
+def test_parking_judges_the_approach_speed():
     assert approach_speed(parked(0, 0, 1, 1)) == pytest.approx([1.0])
     away, still, towards, aside = (parked(0, 0, *v) for v in ((-0.5, 0), (0, 0), (0.5, 0), (0, 0.5)))
     assert tasks.parking(still, None, away).tolist() == [False]
@@ -141,7 +141,7 @@ def test_parking():
     assert tasks.parking(towards, None, towards).tolist() == [True]
     assert tasks.parking(parked(0, 0, -2, 0), None, parked(0, 0, -2.5, 0)).tolist() == [False]
     assert tasks.parking(parked(0, 0, -4, 0), None, parked(0, 0, -5, 0)).tolist() == [True]  # too fast to stop
-    # From 15 m/s no car stops within 20 m, from 10 m/s it does; within 10 m nothing is said.
+    # From 15 m/s no car stops within 20 m, from 10 m/s it does; within 10 m everything is permissible.
     assert tasks.parking(parked(0.1, 0, 3.2, 0), None, parked(0.1, 0, 3, 0)).tolist() == [True]
     assert tasks.parking(parked(0.1, 0, 3.2, 0), None, parked(0.1, 0, 2, 0)).tolist() == [False]
     assert tasks.parking(parked(0.25, 0, 0.5, 0), None, parked(0.25, 0, 0, 0)).tolist() == [True]
@@ -168,16 +168,16 @@ def on_the_road(y, vy, *others):
         ([(20, 4, -10, 0), (22, -3, -10, 0)], 3.0),
     ],
 )
-def test_passing_distance(others, miss):
+def test_passing_distance_is_the_nearest_one_within_the_look_ahead(others, miss):
     assert passing_distance(on_the_road(4, 0, *others)) == pytest.approx([miss], rel=1e-5)
 
 
-def test_highway():
+def test_highway_judges_passing_distance_and_road_edges():
     hit, graze, clear = (on_the_road(4, 0, (20, side, -10, 0)) for side in (0, 2, 4))
     assert tasks.highway(graze, None, hit).tolist() == [False]
     assert tasks.highway(hit, None, graze).tolist() == [True]
     assert tasks.highway(clear, None, graze).tolist() == [False]
-    assert tasks.highway(on_the_road(4, 0), None, hit).tolist() == [True]  # it only came into sight
+    assert tasks.highway(on_the_road(4, 0), None, hit).tolist() == [True]  # it was not in sight before
     # 10 m is the right edge, -2 m the left one; y grows to the right.
     right, left, middle = (lambda vy, y=y: on_the_road(y, vy) for y in (9, -1, 4))
     assert tasks.highway(right(1.0), None, right(1.5)).tolist() == [False]
@@ -189,7 +189,7 @@ def test_highway():
     assert tasks.highway(right(-1.0), None, right(1.5)).tolist() == [False]
 
 
-# ------------------------------------------------------------------ as they are used
+# ------------------------------------------------------------------ in their environments
 
 ENTRIES = [
     (algo, env_id, entry)
@@ -200,11 +200,11 @@ ENTRIES = [
 
 
 @pytest.mark.parametrize(("algo", "env_id", "entry"), ENTRIES, ids=[f"{a}-{e}" for a, e, _ in ENTRIES])
-def test_every_entry_labels_what_its_environment_returns(algo, env_id, entry):
+def test_configured_ap_functions_give_both_labels_in_their_environments(algo, env_id, entry):
     env = gym.make(env_id, **entry.get("env_kwargs", {}))
     transitions = []
     obs, _ = env.reset(seed=0)
-    actions = env.action_space  # highway-env makes itself another, unseeded, at every reset
+    actions = env.action_space  # highway-env replaces it by an unseeded one at every reset
     actions.seed(0)
     for _ in range(60):
         action = actions.sample()
@@ -233,7 +233,7 @@ def swings_up(obs):
     return np.float32([2 * np.sign(rate * -pendulum_energy_of(obs[None])[0]) or 2])
 
 
-def test_the_hard_case_is_warned_of():
+def test_check_gives_advice_about_the_height_of_the_pendulum():
     env = gym.make("Pendulum-v1")
     obs, _ = env.reset(seed=0)
     for _ in range(200):

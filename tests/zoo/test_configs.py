@@ -1,3 +1,5 @@
+"""Mistakes on the command line and in YAML are refused in one sentence; the shipped configurations are valid."""
+
 import re
 from pathlib import Path
 
@@ -41,7 +43,7 @@ from sb3_sap.zoo.configs import check_hyperparameters
         (["--storage", "sqlite:////no/folder/x.db", "--study-name", "x", "--trial-id", "0"], "cannot be opened"),
     ],
 )
-def test_one_sentence(arguments, sentence, capsys):
+def test_mistakes_on_the_command_line_get_one_sentence(arguments, sentence, capsys):
     environment = [] if "--env" in arguments else ["--env", ENV]
     assert main(["train", *environment, "-n", "10", *arguments]) == 1
     error = capsys.readouterr().err
@@ -50,7 +52,7 @@ def test_one_sentence(arguments, sentence, capsys):
     assert error.count("\n") == 1
 
 
-def test_values_that_are_no_python(capsys):
+def test_values_that_are_no_python_are_refused(capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["train", "--env", ENV, "-params", "alpha:high"])
     assert "'high' is no Python" in capsys.readouterr().err
@@ -74,7 +76,7 @@ def test_values_that_are_no_python(capsys):
         ("default: {policy: MlpPolicy, n_timesteps: 10, env_wrapper: gymnasium.Nothing}", "cannot be imported"),
     ],
 )
-def test_what_is_wrong_with_a_yaml_file(text, sentence, capsys):
+def test_invalid_yaml_files_are_refused(text, sentence, capsys):
     Path("own.yml").write_text(text)
     assert main(["train", "--env", ENV, "-n", "10", "--conf-file", "own.yml"]) == 1
     assert sentence in capsys.readouterr().err
@@ -83,16 +85,16 @@ def test_what_is_wrong_with_a_yaml_file(text, sentence, capsys):
 @pytest.mark.parametrize(
     ("algo", "settings"),
     [
-        ("ppo", {"normalize": True, "frame_stack": 2}),  # which keeps what it is given
+        ("ppo", {"normalize": True, "frame_stack": 2}),  # which stores observations as they are
         ("sac", {"normalize": False, "frame_stack": 2}),
         ("sac", {"normalize": True, "frame_stack": 1}),
     ],
 )
-def test_frames_may_be_stacked_where_nothing_is_normalised_below(algo, settings):
+def test_frames_can_be_stacked_without_normalised_observations(algo, settings):
     check_hyperparameters(algo, settings, "own.yml")
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_config_of_ours_is_right(algo):
+def test_shipped_configurations_are_valid(algo):
     for name, entry in load_config(algo).items():
         check_hyperparameters(algo, entry, name)

@@ -1,4 +1,4 @@
-"""Four workers, each a process of its own, on one study in a real PostgreSQL on loopback."""
+"""Four workers, each in its own process, run one study on a PostgreSQL server on loopback."""
 
 import os
 import re
@@ -60,7 +60,7 @@ def server():
 
 @pytest.fixture
 def workers():
-    """Filled by the test; none outlives it."""
+    """Filled by the test, which none of them outlives."""
     started = []
     yield started
     for worker in started:
@@ -83,8 +83,8 @@ def finish(workers, folder):
         assert worker.wait(timeout=400) == 0, (folder / f"{number}.log").read_text()
 
 
-def told_finished(folder):
-    """How often any worker said of a trial that it finished."""
+def reported_finished(folder):
+    """How often workers reported that a trial has finished."""
     logs = "".join(path.read_text() for path in folder.glob("*.log"))
     return Counter(map(int, re.findall(r"Trial (\d+) (?:finished|pruned)", logs)))
 
@@ -92,7 +92,7 @@ def told_finished(folder):
 def check(study, folder):
     finished = [trial for trial in study.trials if trial.state.name in ("COMPLETE", "PRUNED")]
     assert len(finished) == TRIALS
-    assert told_finished(folder) == Counter(trial.number for trial in finished)  # none is run twice
+    assert reported_finished(folder) == Counter(trial.number for trial in finished)  # none is run twice
     assert len({trial.user_attrs["seed"] for trial in finished}) == TRIALS
     assert len({tuple(trial.params.values()) for trial in finished}) == TRIALS
     assert not [trial for trial in study.trials if trial.state.name in ("RUNNING", "WAITING")]
@@ -106,7 +106,7 @@ def test_four_workers_finish_one_study(server, workers, tmp_path):
     assert len({trial.user_attrs["worker"] for trial in study.trials if "worker" in trial.user_attrs}) > 1
 
 
-def test_the_trial_of_a_killed_worker_is_run_by_another(server, workers, tmp_path):
+def test_trial_of_a_killed_worker_is_run_by_another(server, workers, tmp_path):
     start_workers(workers, server, "killed", tmp_path)
     victim = trial = None
     deadline = time.monotonic() + 300
@@ -117,7 +117,7 @@ def test_the_trial_of_a_killed_worker_is_run_by_another(server, workers, tmp_pat
                 states=(optuna.trial.TrialState.RUNNING,)
             )
         except KeyError:
-            running = []  # nobody made the study yet
+            running = []  # the study does not exist yet
         for candidate in running:
             owner = candidate.user_attrs.get("worker", ":0").split(":")[1]
             victim = next((worker for worker in workers if str(worker.pid) == owner), None)

@@ -1,4 +1,4 @@
-"""RL Zoo's commands as a user types them, with runs of some ten steps: what they leave, and what they say is wrong."""
+"""RL Zoo's commands `train`, `enjoy`, `record-video` and `plot`, as a user types them, with runs of few steps."""
 
 import io
 import os
@@ -19,7 +19,7 @@ from sb3_sap.zoo.registration import small_buffers
 
 
 class CountsEnds(BaseCallback):
-    """Named in YAML by its dotted name."""
+    """A callback that YAML gives by its dotted name."""
 
     ends = 0
 
@@ -30,10 +30,7 @@ class CountsEnds(BaseCallback):
         type(self).ends += 1
 
 
-# -------------------------------------------------------------------- train, enjoy
-
-
-def test_train_leaves_what_rl_zoo_leaves():
+def test_train_writes_the_files_of_rl_zoo_and_continues_a_saved_model():
     command = ["train", "--algo", "ddpg_ap", "--env", ENV, "-n", "60", "--eval-freq", "30", "--eval-episodes", "1"]
     command += ["--save-freq", "20", "--save-replay-buffer", "--seed", "3", "-P", "-params", "alpha:0.7", *QUICK]
     assert main(command) == 0
@@ -64,7 +61,7 @@ def test_train_leaves_what_rl_zoo_leaves():
     assert main(again) == 0
     model = DDPGAP.load(Path("logs/ddpg_ap") / f"{FOLDER}_2" / f"{FOLDER}.zip")
     assert model.num_timesteps == 10
-    assert model._steps_of_earlier_learns == 60  # t_k counts over the model's life
+    assert model._steps_of_earlier_learns == 60  # t_k counts the steps of all learns
 
     printed = io.StringIO()
     with redirect_stdout(printed):
@@ -72,7 +69,7 @@ def test_train_leaves_what_rl_zoo_leaves():
     assert "best_model.zip" in printed.getvalue()
 
 
-def test_the_default_entry_serves_other_environments():
+def test_default_entry_is_used_for_other_environments():
     command = ["train", "--algo", "sac_ap", "--env", "MountainCarContinuous-v0", "-n", "20", "--eval-freq", "-1"]
     command += ["--conf-file", "own.yml", "-params", "policy_kwargs:dict(net_arch=[8])"]
     settings = {"policy": "MlpPolicy", "n_timesteps": 20, "ap_function": "tests_ap.never", "callback": ["counts.Ends"]}
@@ -82,11 +79,11 @@ def test_the_default_entry_serves_other_environments():
     Path("own.yml").write_text(yaml.safe_dump({"default": settings}))
     CountsEnds.ends = 0
     assert main(command) == 0
-    assert CountsEnds.ends == 1  # rl_zoo3 tells the first callback twice
+    assert CountsEnds.ends == 1  # although rl_zoo3 calls the first callback twice
 
 
 def test_modules_of_the_current_folder_are_found(monkeypatch):
-    """As `python -m sb3_sap.zoo` finds them; the console command has its own folder on the path instead."""
+    """As with `python -m sb3_sap.zoo`; the path of the console command has the folder of the command instead."""
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path != os.getcwd()])
     Path("nearby_env.py").write_text(
         "import gymnasium as gym\n"
@@ -104,7 +101,7 @@ def all_permissible(obs, actions, next_obs):
     return np.ones(len(actions), dtype=bool)
 
 
-def test_watching_needs_no_buffers(tmp_path):
+def test_models_are_loaded_with_small_buffers_to_be_watched(tmp_path):
     DDPGAP("MlpPolicy", rl_zoo3.create_test_env(ENV, should_render=False, hyperparams={}), seed=1).save("model")
     with small_buffers():
         model = rl_zoo3.ALGOS["ddpg_ap"].load("model")
@@ -113,8 +110,8 @@ def test_watching_needs_no_buffers(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_options_of_an_entry_hold_for_evaluations_and_films():
-    # Without them it has other observations. The share for validation is one that few examples cannot have.
+def test_env_kwargs_of_an_entry_apply_to_evaluations_and_videos():
+    # Without env_kwargs it has other observations. A validation fraction that small is invalid for a small buffer.
     which = ["--algo", "sac_ap", "--env", "highway-fast-v0"]
     command = ["train", *which, "-n", "60", "--eval-freq", "40", "--eval-episodes", "1"]
     assert main([*command, "-params", "validation_fraction:0.05", "learning_starts:60"]) == 0
@@ -124,7 +121,7 @@ def test_the_options_of_an_entry_hold_for_evaluations_and_films():
 
 
 @pytest.mark.slow
-def test_watching_filming_and_plotting(capsys):
+def test_trained_models_are_watched_recorded_and_plotted(capsys):
     command = ["train", "--algo", "ddpg_ap", "--env", ENV, "-n", "100", "--eval-freq", "50", "--eval-episodes", "2"]
     for _ in range(2):  # rl_zoo3 compares several runs of several episodes, never one
         assert main([*command, "--save-freq", "50", "-tb", "boards", "-params", *QUICK]) == 0
@@ -154,7 +151,7 @@ def test_watching_filming_and_plotting(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", [name for name in ALGORITHMS if name != "ddpg_ap"])
 def test_every_algorithm_trains_and_tunes(algo):
-    """The whole search space of each, and what it leaves is watched."""
+    """With the whole search space of each; the saved model is watched."""
     small = ["policy_kwargs:dict(net_arch=[8])", "batch_size:8", "buffer_size:500", "learning_starts:5"]
     env = "MountainCar-v0" if algo in ("dqn_ap", "qrdqn_ap") else ENV
     command = ["train", "--algo", algo, "--env", env, "-n", "30", "--eval-freq", "-1", "-params", *small]
@@ -166,6 +163,6 @@ def test_every_algorithm_trains_and_tunes(algo):
 
 
 @pytest.mark.parametrize("arguments", [["plot"], ["plot", "nothing"]])
-def test_plot_says_what_it_draws(arguments, capsys):
+def test_plot_without_a_known_kind_names_the_kinds(arguments, capsys):
     assert main(arguments) == 1
     assert "'study'" in capsys.readouterr().err

@@ -1,3 +1,5 @@
+"""Tuning: the search spaces, samplers and pruners, and what becomes of a study."""
+
 import os
 from pathlib import Path
 
@@ -21,7 +23,7 @@ GUIDED = [name for name, cls in ALGORITHMS.items() if issubclass(cls, ActionPerm
 
 
 @pytest.mark.parametrize("algo", GUIDED)
-def test_alpha_and_t_k_come_first_and_a_trial_converts_to_what_was_sampled(algo):
+def test_search_space_begins_with_alpha_and_t_k_and_trials_convert_to_what_was_sampled(algo):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
     for only in (True, False):
         trial = study.ask()
@@ -30,7 +32,7 @@ def test_alpha_and_t_k_come_first_and_a_trial_converts_to_what_was_sampled(algo)
         assert list(trial.params)[:2] == ["alpha", "t_k"]
         assert (len(trial.params) == 2) == only
         converted = HYPERPARAMS_CONVERTER[algo](trial.params)
-        sampled.pop("action_noise", None)  # rl_zoo3 makes it of these two later
+        sampled.pop("action_noise", None)  # rl_zoo3 builds it from the other two later
         converted = {key: value for key, value in converted.items() if key not in ("noise_type", "noise_std")}
         assert converted == sampled
         check_hyperparameters(algo, sampled, "the search space")
@@ -38,7 +40,7 @@ def test_alpha_and_t_k_come_first_and_a_trial_converts_to_what_was_sampled(algo)
     assert t_k_range(15_000) == (250, 5000)
 
 
-def test_a_trial_draws_the_same_in_whichever_worker():
+def test_trial_samples_the_same_in_every_worker():
     def draw(number_of_trials):
         sampler = SeededByTrial(lambda seed: optuna.samplers.RandomSampler(seed=seed), 7)
         study = optuna.create_study(sampler=sampler)
@@ -48,7 +50,7 @@ def test_a_trial_draws_the_same_in_whichever_worker():
     assert len(set(draw(5))) == 5
 
 
-def test_a_trial_too_many_is_known_by_its_number():
+def test_surplus_trial_is_recognised_by_its_number():
     study = optuna.create_study()
     first, second, third = (study.ask() for _ in range(3))
     assert [is_surplus(study, trial.number, 2) for trial in (first, second, third)] == [False, False, True]
@@ -56,13 +58,13 @@ def test_a_trial_too_many_is_known_by_its_number():
     assert not is_surplus(study, third.number, 2)
 
 
-def test_passwords_are_not_shown():
+def test_passwords_are_hidden():
     shown = without_password("sb3-sap optimize --storage postgresql://me:secret@host:5432/db --study-name s")
     assert shown == "sb3-sap optimize --storage postgresql://me:***@host:5432/db --study-name s"
 
 
 @pytest.mark.slow
-def test_optimize_replay_retest(capsys):
+def test_study_is_optimised_replayed_retested_and_plotted(capsys):
     where = ["--storage", "study.log"]
     assert optimize(*where, "--max-total-trials", "4", "--n-startup-trials", "2", "--n-evaluations", "3") == 0
     study = optuna.load_study(study_name="study", storage=open_storage("study.log"))
@@ -71,11 +73,11 @@ def test_optimize_replay_retest(capsys):
     report = Path("logs/ddpg_ap") / f"report_{FOLDER}_study"
     assert {path.name for path in report.iterdir()} >= {"report.md", "trials.csv", "history.png", "contour.png"}
     assert "| trial | value | alpha | t_k | seed |" in (report / "report.md").read_text()
-    # Enough were run already.
+    # Enough trials have been run already.
     assert optimize(*where, "--max-total-trials", "4") == 0
     assert len(optuna.load_study(study_name="study", storage=open_storage("study.log")).trials) == 4
 
-    # Trial 0 again, with its own seed, is trial 0 again.
+    # With its own seed, trial 0 is repeated exactly.
     command = ["train", "--env", ENV, "-n", "60", "--eval-freq", "20", "--eval-episodes", "1", "--trial-id", "0"]
     assert main([*command, *where, "--study-name", "study", "-params", *QUICK]) == 0
     [path] = Path("logs").rglob("evaluations.npz")
@@ -94,7 +96,7 @@ def test_optimize_replay_retest(capsys):
     rows = Path("retest/retest.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * 2
     assert rows[1].startswith("default,10000,60,wheel-2,")
-    assert main(command) == 0  # what is there is not trained again
+    assert main(command) == 0  # finished runs are not trained again
     assert Path("retest/retest.csv").read_text().splitlines() == rows
     command[command.index("wheel-2")] = "eroad"
     assert main(command) == 1
@@ -106,18 +108,18 @@ def test_optimize_replay_retest(capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pruner", ["median", "halving"])
-def test_nothing_is_pruned_before_every_trial_is_guided(pruner):
-    """Every trial but the first would be pruned at once, because it is worse."""
-    asked = []
+def test_trials_are_not_pruned_before_guidance_begins(pruner):
+    """Without that, every trial but the first would be pruned at once, because it is worse."""
+    decisions = []
     decide = optuna.pruners.MedianPruner.prune, optuna.pruners.SuccessiveHalvingPruner.prune
     for cls, original in zip(
         (optuna.pruners.MedianPruner, optuna.pruners.SuccessiveHalvingPruner), decide, strict=True
     ):
 
         def prune(self, study, trial, original=original):
-            verdict = original(self, study, trial)
-            asked.append((trial.last_step, verdict))
-            return verdict
+            pruned = original(self, study, trial)
+            decisions.append((trial.last_step, pruned))
+            return pruned
 
         cls.prune = prune
     try:
@@ -125,11 +127,11 @@ def test_nothing_is_pruned_before_every_trial_is_guided(pruner):
         assert optimize("--storage", "study.log", "--no-optim-plots", *flags) == 0
     finally:
         optuna.pruners.MedianPruner.prune, optuna.pruners.SuccessiveHalvingPruner.prune = decide
-    assert asked
-    assert not [step for step, verdict in asked if verdict and step <= t_k_range(60)[1]]
+    assert decisions
+    assert not [step for step, pruned in decisions if pruned and step <= t_k_range(60)[1]]
 
 
-def test_a_study_in_memory_leaves_a_report():
+def test_study_in_memory_writes_a_report():
     assert optimize("-n", "20", "--n-trials", "2", "--no-optim-plots", "--optimization-log-path", "trials") == 0
     report = Path("logs/ddpg_ap") / f"report_{FOLDER}_study"
     assert {path.name for path in report.iterdir()} == {"report.md", "trials.csv"}
@@ -138,14 +140,14 @@ def test_a_study_in_memory_leaves_a_report():
 
 
 @pytest.mark.parametrize(("n_trials", "title"), [(1, "only 1 trial,"), (6, "only 6 trials,"), (20, "20 trials, the")])
-def test_a_picture_of_few_trials_says_that_it_is_thin(n_trials, title):
+def test_contour_of_few_trials_says_so_in_its_title(n_trials, title):
     study = optuna.create_study(study_name="study", sampler=optuna.samplers.RandomSampler(seed=1))
     study.optimize(lambda trial: trial.suggest_float("x", 0, 1) + trial.suggest_float("y", 0, 1), n_trials)
     [axis, *_] = contour(study, "x", "y", "value").axes
     assert axis.get_title().startswith(f"study: {title}")
 
 
-def test_a_tuned_noise_of_none_is_loaded():
+def test_tuned_noise_of_none_is_loaded():
     study = optuna.create_study(study_name="study", storage=open_storage("study.log"), direction="maximize")
     space = {"using_her_replay_buffer": False, "her_kwargs": {}}
     study.enqueue_trial({"noise_type": None})
@@ -157,14 +159,14 @@ def test_a_tuned_noise_of_none_is_loaded():
     assert main([*command, "--study-name", "study"]) == 0
 
 
-def test_a_study_of_something_else_is_not_continued(capsys):
+def test_study_of_another_algorithm_is_not_continued(capsys):
     study = optuna.create_study(study_name="study", storage=open_storage("study.log"))
     study.set_user_attr("algo", "sac_ap")
     assert optimize("--storage", "study.log") == 1
     assert "is one of sac_ap on sap/LaneKeeping-v0, not of ddpg_ap" in capsys.readouterr().err
 
 
-def test_help_tells_ours_and_theirs(capsys):
+def test_help_lists_options_of_this_package_and_of_rl_zoo(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["optimize", "--help"])
     text = capsys.readouterr().out
@@ -174,8 +176,8 @@ def test_help_tells_ours_and_theirs(capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("simulator", ["highway", "torcs"])
-def test_a_study_maximises_the_score_of_laps(simulator):
-    """The value of a trial is the mean of what `sb3-sap evaluate` says of the model that it saved."""
+def test_study_maximises_the_score_of_laps(simulator):
+    """The value of a trial is the mean score that `sb3-sap evaluate` gives the model that it saved."""
     if simulator == "torcs":
         try:
             gym.make(ENVIRONMENTS["torcs"])

@@ -1,3 +1,5 @@
+"""Trials in parallel: workers that end, fail, or are interrupted."""
+
 import os
 import signal
 import subprocess
@@ -13,11 +15,11 @@ from sb3_sap.zoo.workers import count_workers, run_workers
 
 
 @pytest.mark.slow
-def test_trials_of_workers_side_by_side_are_those_of_one():
+def test_two_workers_run_the_same_trials_as_one():
     flags = ["--n-trials", "3", "--n-startup-trials", "3", "--no-optim-plots"]
     assert optimize("--storage", "one.log", *flags) == 0
     assert optimize("--n-jobs", "2", *flags) == 0
-    [file] = Path("logs").rglob("study.log")  # where a study is kept of which no storage was named
+    [file] = Path("logs").rglob("study.log")  # the default storage
     alone, together = (
         optuna.load_study(study_name="study", storage=open_storage(str(path))).trials for path in ("one.log", file)
     )
@@ -40,7 +42,7 @@ def test_workers_end_with_the_command_that_started_them(end):
             return []
         try:
             return optuna.load_study(study_name="study", storage=open_storage("study.log")).trials
-        except KeyError:  # the file is there, and the study not yet
+        except KeyError:  # the file exists, but not yet the study
             return []
 
     try:
@@ -57,7 +59,7 @@ def test_workers_end_with_the_command_that_started_them(end):
 
 @pytest.fixture
 def stand_in(monkeypatch):
-    """A worker that fails where it has two trials, and else leaves a file once its pipe is closed."""
+    """Replaces a worker: it fails if it has two trials, and otherwise writes a file once its pipe is closed."""
     Path("worker").write_text(
         '#!/bin/sh\ncase "$*" in\n  *"--n-trials 2") exit 3;;\n  *) cat; echo "$@" > ended;;\nesac\n'
     )
@@ -65,14 +67,14 @@ def stand_in(monkeypatch):
     monkeypatch.setattr(sys, "executable", str(Path("worker").absolute()))
 
 
-def test_a_worker_that_fails_ends_the_others(stand_in):
+def test_failing_worker_ends_the_others(stand_in):
     with pytest.raises(RuntimeError, match="ended with exit status 3, and the others were ended"):
         run_workers("sb3-sap optimize --seed 1 --n-jobs 2", 2, 3, ["--seed", "7"])
-    told = "-m sb3_sap.zoo optimize --seed 1 --n-jobs 2 --seed 7 --n-jobs 1 --worker --n-trials 1"
-    assert Path("ended").read_text().strip() == told
+    arguments = "-m sb3_sap.zoo optimize --seed 1 --n-jobs 2 --seed 7 --n-jobs 1 --worker --n-trials 1"
+    assert Path("ended").read_text().strip() == arguments
 
 
-def test_ctrl_c_ends_workers(stand_in, monkeypatch):
+def test_ctrl_c_ends_the_workers(stand_in, monkeypatch):
     def interrupt(seconds):
         raise KeyboardInterrupt
 
@@ -82,7 +84,7 @@ def test_ctrl_c_ends_workers(stand_in, monkeypatch):
     assert Path("ended").exists()
 
 
-def test_how_many_workers():
+def test_workers_are_limited_by_n_jobs_and_trials():
     assert [count_workers(n_jobs, 3) for n_jobs in (1, 2, 5)] == [1, 2, 3]
     assert count_workers(-1, 10_000) == os.cpu_count()
     for n_jobs in (0, -2):

@@ -9,6 +9,7 @@ from sb3_sap.envs.torcs.installation import Installation, TorcsNotFoundError, fi
 
 @pytest.fixture(scope="module")
 def torcs():
+    """The installation. Without one, tests are skipped; with SB3_SAP_REQUIRE_TORCS set, as in CI, they fail."""
     try:
         return find_installation()
     except TorcsNotFoundError as error:

@@ -1,4 +1,4 @@
-"""The AP function of sap/TorcsDriving-v0, on transitions computed by hand; no TORCS is needed."""
+"""The AP function of sap/TorcsDriving-v0, on transitions computed by hand; TORCS is not needed."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_lateral_velocity_is_positive_to_the_left():
     assert lateral_velocity(observe(angle=-np.pi / 6, speed=36)) == pytest.approx([5.0])
 
 
-def test_running_wide_is_a_mistake():
+def test_running_wide_is_not_permissible():
     # 0.6 m from the left edge, going there at 36 km/h · sin(0.1) = 1 m/s, and faster than before
     assert not permissible(observe(0.85, -0.05, 36), observe(0.9, -0.1, 36))
     # the same, but the step took lateral speed away
@@ -38,13 +38,13 @@ def test_running_wide_is_a_mistake():
     assert permissible(observe(-0.95, -0.05, 36), observe(-0.9, -0.1, 36))
 
 
-def test_both_edges_are_alike():
+def test_both_edges_are_treated_alike():
     assert not permissible(observe(-0.85, 0.05, 36), observe(-0.9, 0.1, 36))
 
 
-def test_too_fast_for_the_curve_ahead():
+def test_accelerating_when_too_fast_for_the_curve_ahead_is_not_permissible():
     # A curve of 10 m radius holds 20 · 10 = 200 m²/s², and braking takes off 2 · 20 · 20 = 800 on the 20 m to it:
-    # beyond √1000 = 31.6 m/s = 113.8 km/h nobody can hold it.
+    # beyond √1000 = 31.6 m/s = 113.8 km/h no car can hold it.
     assert not too_fast(observe(speed=113, radius_ahead=10))[0]
     assert too_fast(observe(speed=115, radius_ahead=10))[0]
     assert not permissible(observe(speed=115, radius_ahead=10), observe(speed=116, radius_ahead=10))
@@ -52,8 +52,8 @@ def test_too_fast_for_the_curve_ahead():
     assert permissible(observe(speed=113, radius_ahead=10), observe(speed=116, radius_ahead=10))
 
 
-def test_dawdling():
-    # 3 m/s² hold a curve of 12 m radius at 6 m/s = 21.6 km/h: slower than that nobody needs to be.
+def test_slowing_down_without_need_is_not_permissible():
+    # 3 m/s² hold a curve of 12 m radius at 6 m/s = 21.6 km/h: no car needs to be slower than that.
     assert dawdles(observe(speed=21, radius_ahead=12))[0]
     assert not dawdles(observe(speed=22, radius_ahead=12))[0]
     assert not permissible(observe(speed=21, radius_ahead=12), observe(speed=20, radius_ahead=12))
@@ -67,7 +67,7 @@ def test_dawdling():
     assert permissible(observe(0.0, 0.3, 21, radius_ahead=12), observe(0.0, 0.3, 20, radius_ahead=12))
 
 
-def test_labels_are_one_per_row():
+def test_ap_function_gives_one_label_per_row():
     rows = np.concatenate([observe(0.85, -0.05, 36), observe()])
     after = np.concatenate([observe(0.9, -0.1, 36), observe()])
     assert ap_function(rows, np.zeros((2, 2)), after).tolist() == [False, True]

@@ -1,3 +1,5 @@
+"""What is refused as an installation of TORCS, and the command that installs it."""
+
 import shutil
 
 import pytest
@@ -7,7 +9,7 @@ from sb3_sap.envs.torcs.installation import DATA, MODULES, TorcsNotFoundError, f
 from sb3_sap.envs.torcs.physics import Physics
 
 
-def test_nothing_installed(monkeypatch, tmp_path, capsys):
+def test_missing_installation_names_the_install_command(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("TORCS_ROOT", str(tmp_path))
     with pytest.raises(TorcsNotFoundError, match=r"no TORCS in TORCS_ROOT=.*sb3-sap torcs install"):
         find_installation()
@@ -15,13 +17,13 @@ def test_nothing_installed(monkeypatch, tmp_path, capsys):
     assert "sb3-sap torcs install" in capsys.readouterr().err
 
 
-def test_another_machine(monkeypatch):
+def test_other_platforms_are_refused(monkeypatch):
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
     with pytest.raises(TorcsNotFoundError, match="on Linux on x86_64 alone, but this is linux on aarch64"):
         find_installation()
 
 
-def test_another_version_and_missing_parts(copy_of_torcs, monkeypatch):
+def test_other_versions_and_missing_files_are_refused(copy_of_torcs, monkeypatch):
     monkeypatch.setenv("TORCS_ROOT", str(copy_of_torcs.root))
     assert find_installation() == copy_of_torcs
     library = copy_of_torcs.root / MODULES["simu"]
@@ -35,7 +37,7 @@ def test_another_version_and_missing_parts(copy_of_torcs, monkeypatch):
         find_installation()
 
 
-def test_damaged_car(copy_of_torcs):
+def test_damaged_car_file_is_refused(copy_of_torcs):
     car = copy_of_torcs.car("car1-trb1")
     whole = car.read_text()
     car.write_text(whole[:5000])
@@ -46,7 +48,7 @@ def test_damaged_car(copy_of_torcs):
         Physics("g-track-3", installation=copy_of_torcs)
 
 
-def test_damaged_surfaces(copy_of_torcs):
+def test_damaged_surfaces_are_refused(copy_of_torcs):
     copy_of_torcs.surfaces().write_text("")
     with pytest.raises(ValueError, match=r"surfaces.xml, the road surfaces, is not the one"):
         Physics("g-track-3", installation=copy_of_torcs)
@@ -54,7 +56,7 @@ def test_damaged_surfaces(copy_of_torcs):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("apt-get") is None, reason="this is not Debian")
-def test_install_command(torcs, tmp_path, monkeypatch, capsys):
+def test_install_command_installs_every_track(torcs, tmp_path, monkeypatch, capsys):
     root = tmp_path / "new"
     assert main(["torcs", "install", "--root", str(root)]) == 0
     assert "38 tracks" in " ".join(capsys.readouterr().out.split())

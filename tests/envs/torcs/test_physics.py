@@ -1,4 +1,4 @@
-"""TORCS in process. Without TORCS these are skipped; with SB3_SAP_REQUIRE_TORCS set, as in CI, they must run."""
+"""The physics of TORCS in this process: its checks, memory, cars and tracks."""
 
 import contextlib
 import gc
@@ -21,7 +21,7 @@ from sb3_sap.envs.torcs.track_files import flatten
 
 
 @pytest.mark.slow
-def test_closing_gives_everything_back(torcs):
+def test_closing_frees_the_memory(torcs):
     def resident_after(times):
         for _ in range(times):
             simulation = Physics("g-track-3")
@@ -32,14 +32,14 @@ def test_closing_gives_everything_back(torcs):
 
     before = resident_after(20)
     growth = []
-    for _ in range(3):  # the allocator takes a page now and then: a leak grows every time
+    for _ in range(3):  # the allocator takes some pages now and then, but a leak grows every time
         after = resident_after(60)
         growth.append(after - before)
         before = after
     assert min(growth) < 1_000  # each car's parameters are 0.1 MB
 
 
-def test_simulation_checks_what_it_is_given(torcs):
+def test_physics_refuses_invalid_arguments(torcs):
     simulation = Physics("g-track-3")
     with pytest.raises(RuntimeError, match="place"):
         simulation.advance(1)
@@ -56,8 +56,8 @@ def test_simulation_checks_what_it_is_given(torcs):
 
 
 @pytest.mark.parametrize("reading", ["angle", "heading", "track_pos", "distance"])
-def test_no_reading_without_a_road(torcs, reading):
-    """TORCS itself would read from address 0, or from a track that was given back."""
+def test_readings_require_a_placed_car(torcs, reading):
+    """TORCS itself would read from address 0, or from a track that was freed."""
     simulation = Physics("g-track-3")
     with pytest.raises(RuntimeError, match="place"):
         getattr(simulation, reading)
@@ -68,7 +68,7 @@ def test_no_reading_without_a_road(torcs, reading):
         getattr(simulation, reading)
 
 
-def test_places_off_the_road_and_factors_out_of_range(torcs):
+def test_places_off_the_road_and_factors_out_of_range_are_refused(torcs):
     simulation = Physics("g-track-3")
     for place in ((0.0, 1.5), (0.0, -1e9), (0.0, 0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1e30)):
         with pytest.raises(ValueError, match="placed on the road"):
@@ -78,8 +78,8 @@ def test_places_off_the_road_and_factors_out_of_range(torcs):
             Physics("g-track-3", **factors)
 
 
-@pytest.mark.skipif(shutil.which("localedef") is None, reason="localedef is not there to make a locale")
-def test_a_locale_with_a_decimal_comma(torcs, tmp_path):
+@pytest.mark.skipif(shutil.which("localedef") is None, reason="localedef is not installed")
+def test_decimal_comma_of_a_locale_changes_no_number(torcs, tmp_path):
     """TORCS reads numbers with strtod, to which "0.5" is then 0: Wheel-2 would be 53 m shorter."""
     made = subprocess.run(
         ["localedef", "-i", "de_DE", "-f", "UTF-8", str(tmp_path / "de_DE.UTF-8")], capture_output=True, check=False
@@ -96,8 +96,8 @@ def test_a_locale_with_a_decimal_comma(torcs, tmp_path):
     assert done.stdout.split() == ["6205.462890625", ","]
 
 
-def test_every_car_shifts(torcs):
-    """The engines' red lines lie between 576 and 1,958 rad/s: gears go by the car's own."""
+def test_cars_of_every_red_line_shift_gears(torcs):
+    """The engines' red lines lie between 576 and 1,958 rad/s: gears depend on the car's own."""
     simulation = Physics("g-track-3", "car1-ow1")
     simulation.place(0.0)
     assert simulation.top_gear == 7
@@ -113,7 +113,7 @@ def test_every_car_shifts(torcs):
         simulator.close()
 
 
-def test_a_simulation_that_outlives_its_module_ends_in_silence(torcs):
+def test_physics_that_outlives_its_module_ends_without_an_error(torcs):
     code = (
         "import os\n"
         "from sb3_sap.envs.torcs.physics import Physics\n"
@@ -124,7 +124,7 @@ def test_a_simulation_that_outlives_its_module_ends_in_silence(torcs):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_track_without_a_road_leaves_no_trace(torcs, tmp_path):
+def test_track_without_a_road_does_not_affect_later_tracks(torcs, tmp_path):
     """TORCS builds this one without a segment; the copy of the library that did so must not be used again."""
     path = tmp_path / "empty.xml"
     path.write_bytes(flatten(torcs.track("eroad")).replace(b'name="Header"', b'name="a/b"'))
@@ -139,7 +139,7 @@ def test_a_track_without_a_road_leaves_no_trace(torcs, tmp_path):
     assert "empty.xml" in done.stdout
 
 
-def test_a_trial_that_ends_early_fails():
+def test_trial_that_ends_early_fails():
     assert survives(lambda: None) is None
     assert survives(lambda: 1 / 0) == "gives up"
     assert survives(lambda: os._exit(0)) == "gives up"
@@ -177,7 +177,7 @@ def test_no_track_file_kills_the_process(torcs, tmp_path_factory, data):
             simulation.close()
         Physics("g-track-3").drive_everywhere()
 
-    # Longer than the trial that Physics itself makes.
+    # This limit is longer than that of the trial in Physics itself.
     assert survives(build_and_drive, limit=60) is None
 
 

@@ -1,3 +1,5 @@
+"""Replays of traces that TORCS recorded, which must be identical to the bit, and other figures of TORCS itself."""
+
 import json
 from pathlib import Path
 
@@ -24,7 +26,7 @@ def test_replays_are_identical_to_the_bit(torcs, name):
     assert set(found.largest_deviation.values()) == {0.0}
 
 
-def test_replay_takes_commands_from_columns_too(torcs, tmp_path):
+def test_replay_takes_commands_from_columns(torcs, tmp_path):
     table = pd.read_csv(TRACES / "eroad.csv.gz", dtype=str).assign(commanded=1)
     table.to_csv(tmp_path / "eroad.csv.gz", index=False)
     conditions = json.loads(START.read_text())
@@ -35,7 +37,7 @@ def test_replay_takes_commands_from_columns_too(torcs, tmp_path):
     assert not replay(tmp_path / "eroad.csv.gz", tmp_path / "start.json").identical
 
 
-def test_replay_notices_a_change(torcs, tmp_path):
+def test_replay_detects_a_changed_condition(torcs, tmp_path):
     conditions = json.loads(START.read_text())
     conditions["common"]["skill_level"] = 3
     (tmp_path / "start.json").write_text(json.dumps(conditions))
@@ -45,7 +47,7 @@ def test_replay_notices_a_change(torcs, tmp_path):
     assert found.largest_deviation["x_m"] > 0.01
 
 
-def test_replay_command(torcs, tmp_path, capsys):
+def test_replay_command_writes_its_result_and_reports_missing_files(torcs, tmp_path, capsys):
     out = tmp_path / "out.json"
     trace = str(TRACES / "eroad.csv.gz")
     assert main(["torcs", "replay", trace, "--start", str(START), "--json", str(out)]) == 0
@@ -55,7 +57,7 @@ def test_replay_command(torcs, tmp_path, capsys):
     assert main(["torcs", "replay", str(START), "--start", str(START)]) == 1
 
 
-def test_start_of_the_race_engine(torcs):
+def test_race_grid_is_that_of_the_race_engine(torcs):
     for name, conditions in json.loads(START.read_text())["traces"].items():
         grid = race_grid(torcs.track(name), conditions["track_length_m"])
         assert grid["distance"] == pytest.approx(conditions["grid"]["start_pos_m"])
@@ -68,7 +70,7 @@ def test_start_of_the_race_engine(torcs):
 
 
 @pytest.mark.parametrize("name", list(TRACKS))
-def test_shipped_plans_are_those_of_torcs(torcs, name):
+def test_shipped_tracks_have_length_and_width_of_torcs(torcs, name):
     simulation = Physics(name)
     assert simulation.length == pytest.approx(get_track(name).length, abs=0.06)
     assert simulation.road.segments[0].width == get_track(name).width

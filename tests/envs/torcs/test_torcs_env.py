@@ -1,3 +1,5 @@
+"""The environments on TORCS: the task, determinism, memory, and what is refused."""
+
 import gc
 import json
 import math
@@ -45,7 +47,7 @@ def test_environments_pass_the_checkers(torcs, name):
     check_sb3(gym.make(name))
 
 
-def test_a_lap_at_the_default_speed(torcs):
+def test_feedback_drives_a_lap_at_the_default_speed(torcs):
     env = gym.make("sap/TorcsLaneKeeping-v0", track="g-track-3")
     env.reset()
     speeds, positions, done = [], [], False
@@ -60,7 +62,7 @@ def test_a_lap_at_the_default_speed(torcs):
     assert all(abs(speed - 50) < 1.5 for speed in speeds[25:])
 
 
-def test_starts(torcs):
+def test_start_follows_track_options_and_seed(torcs):
     env = gym.make("sap/TorcsLaneKeeping-v0", track="eroad")
     _, info = env.reset()
     assert info["distance"] == pytest.approx(3260.43 - 100, abs=0.1)
@@ -86,7 +88,7 @@ def test_positive_steering_turns_left(torcs):
     assert info["track_pos"] > 0
 
 
-def test_pedals(torcs):
+def test_pedals_accelerate_shift_and_brake(torcs):
     env = gym.make("sap/TorcsDriving-v0", track="b-speedway")
     env.reset()
     for _ in range(100):
@@ -100,13 +102,13 @@ def test_pedals(torcs):
     assert reward == pytest.approx(info["speed_x"] / 3.6 * 0.1, rel=0.15)  # metres of a step
 
 
-def test_pictures(torcs):
+def test_rendered_picture_shows_something(torcs):
     env = gym.make("sap/TorcsLaneKeeping-v0", track="g-track-3", render_mode="rgb_array")
     env.reset()
     assert env.render().std() > 10
 
 
-def test_same_seed_and_actions_same_bits(torcs):
+def test_same_seed_and_actions_give_the_same_bits(torcs):
     env = gym.make("sap/TorcsLaneKeeping-v0", track="eroad", random_start=True)
     first = drive(env, 60)
     assert drive(env, 60) == first  # after a reset
@@ -115,7 +117,7 @@ def test_same_seed_and_actions_same_bits(torcs):
     assert drive(env, 60) == first
     other.close()
     env.close()
-    env = gym.make("sap/TorcsLaneKeeping-v0", track="eroad", random_start=True)  # libraries that were used before
+    env = gym.make("sap/TorcsLaneKeeping-v0", track="eroad", random_start=True)  # with libraries that were used before
     assert drive(env, 60) == first
     child = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n" + ANOTHER_PROCESS],
@@ -133,7 +135,7 @@ print(json.dumps(drive(gym.make("sap/TorcsLaneKeeping-v0", track="eroad", random
 """
 
 
-def test_two_environments_side_by_side(torcs):
+def test_environments_side_by_side_drive_as_alone(torcs):
     alone = [drive(gym.make("sap/TorcsLaneKeeping-v0", track=name), 40) for name in ("eroad", "wheel-2")]
     pair = [gym.make("sap/TorcsLaneKeeping-v0", track=name) for name in ("eroad", "wheel-2")]
     generators = [np.random.default_rng(0) for _ in pair]
@@ -145,7 +147,7 @@ def test_two_environments_side_by_side(torcs):
             assert info["distance"] == expected[step][5]
 
 
-def test_fork_after_load(torcs):
+def test_loaded_simulator_works_after_a_fork(torcs):
     env = gym.make("sap/TorcsLaneKeeping-v0")
     env.reset()
     assert survives(lambda: drive(env, 20)) is None
@@ -153,7 +155,7 @@ def test_fork_after_load(torcs):
 
 
 @pytest.mark.slow
-def test_worker_processes(torcs):
+def test_environments_in_subprocesses_drive_alike(torcs):
     envs = SubprocVecEnv([lambda: gym.make("sb3_sap:sap/TorcsLaneKeeping-v0")] * 2)
     envs.seed(0)
     envs.reset()
@@ -164,7 +166,7 @@ def test_worker_processes(torcs):
 
 
 @pytest.mark.slow
-def test_memory_stays_flat(torcs):
+def test_resets_use_no_further_memory(torcs):
     env = gym.make("sap/TorcsLaneKeeping-v0", track="g-track-3").unwrapped
 
     def resident():
@@ -179,7 +181,7 @@ def test_memory_stays_flat(torcs):
     assert resident() - before < 2_000
 
 
-def test_libraries_are_used_again(torcs):
+def test_library_copies_are_used_again(torcs):
     def copies():
         gc.collect()
         return sum("simuv2" in line and "r-x" in line for line in Path("/proc/self/maps").read_text().splitlines())
@@ -196,7 +198,7 @@ def test_libraries_are_used_again(torcs):
     assert copies() == before > 0
 
 
-def test_wrong_names_and_values(torcs):
+def test_invalid_names_and_values_are_refused(torcs):
     cases = {
         "did you mean 'wheel-2'": {"track": "wheel2"},
         "did you mean 'car1-trb3' or 'car1-trb1'": {"car": "car1-trb"},
@@ -211,7 +213,7 @@ def test_wrong_names_and_values(torcs):
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_actions_that_are_no_numbers(torcs, name):
+def test_invalid_actions_and_calls_are_refused(torcs, name):
     env = gym.make(name).unwrapped
     with pytest.raises(RuntimeError, match="before reset"):
         env.step(env.action_space.sample())
@@ -229,7 +231,7 @@ def test_actions_that_are_no_numbers(torcs, name):
         env.reset()
 
 
-def test_a_track_of_ones_own(torcs, tmp_path):
+def test_track_file_of_the_user_is_driven_and_refused_once_damaged(torcs, tmp_path):
     own = tmp_path / "own.xml"
     own.write_bytes(flatten(torcs.track("g-track-3")))
     env = gym.make("sap/TorcsLaneKeeping-v0", track=str(own))

@@ -35,7 +35,7 @@ def make(runs, folder, console, monkeypatch, **options):
     """Makes a grid of runs that do nothing and returns the number of failures and the runs that were made."""
     made = []
 
-    def fake(run):
+    def fake(run, snapshot):
         made.append((run.algo, run.seed))
         return {"error": "ValueError: no"} if run.settings.get("gamma") == 0.5 else fake_result(run)
 
@@ -79,11 +79,11 @@ def test_a_failing_run_is_reported_and_the_others_continue(tmp_path, console, mo
 
 
 def test_exit_code_of_the_command(tmp_path, monkeypatch):
-    monkeypatch.setattr(dispatch, "run_in_own_process", fake_result)
+    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run, snapshot: fake_result(run))
     arguments = ["benchmark", "run", "--simulator", "highway", "--steps", "20", "--seeds", "1", "--out", str(tmp_path)]
     assert main([*arguments, "--configurations", "ddpg"]) == 0
     assert len(list((tmp_path / "highway-20" / "runs").glob("ddpg-*-seed0.json"))) == 1
-    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run: {"error": "no"})
+    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run, snapshot: {"error": "no"})
     assert main([*arguments, "--configurations", "sac"]) == 1
 
 

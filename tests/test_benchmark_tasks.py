@@ -237,7 +237,7 @@ def test_the_command_writes_a_page(tmp_path, monkeypatch, capsys):
     for configuration, runs in grid.items():
         for of in runs:
             write_result(of, folder, synthetic(of, configuration.name))
-    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run: {"error": "nothing is missing"})
+    monkeypatch.setattr(dispatch, "run_in_own_process", lambda run, snapshot: {"error": "nothing is missing"})
     command = ["benchmark", "task", CAR, "--steps", "40", "--seeds", "2", "--out", str(tmp_path)]
     assert main([*command, "--configurations", *configurations]) == 0
     page = (folder / "returns.md").read_text(encoding="utf-8")

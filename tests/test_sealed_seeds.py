@@ -1,5 +1,6 @@
 """The ledger of sealed seeds, and the runs that are archived."""
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -30,7 +31,7 @@ def test_ledger_tells_opened_seeds_from_sealed_ones():
 def test_ledger_has_rows_that_do_not_overlap():
     rows = sorted(ledger())
     assert len(rows) >= 4
-    assert all(before[1] < after[0] for before, after in zip(rows, rows[1:], strict=False))
+    assert all(before[1] < after[0] for before, after in itertools.pairwise(rows))
 
 
 def test_every_archived_run_has_a_seed_that_the_ledger_opened():

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from sb3_sap.benchmark.configurations import Configuration
 from sb3_sap.benchmark.process import run_in_own_process, stop_all
 from sb3_sap.benchmark.runs import Run
-from sb3_sap.benchmark.store import read_result, write_result
+from sb3_sap.benchmark.store import read_result, snapshot_path, write_result
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 
@@ -57,7 +57,7 @@ def run_grid(
             pre_dispatch="all" if backend == "dask" else "n_jobs",
             return_as="generator_unordered",
         )
-        results = parallel(joblib.delayed(_numbered)(number, run) for number, (_, run) in enumerate(missing))
+        results = parallel(joblib.delayed(_numbered)(number, run, folder) for number, (_, run) in enumerate(missing))
         try:
             for number, result in results:
                 name, run = missing[number]
@@ -78,8 +78,8 @@ def run_grid(
     return failed
 
 
-def _numbered(number: int, run: Run) -> tuple[int, dict[str, Any]]:
-    return number, run_in_own_process(run)
+def _numbered(number: int, run: Run, folder: Path) -> tuple[int, dict[str, Any]]:
+    return number, run_in_own_process(run, snapshot_path(run.name, folder))
 
 
 @contextmanager

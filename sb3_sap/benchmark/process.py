@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 from sb3_sap.benchmark.runs import Run
@@ -28,8 +29,11 @@ SINGLE_THREADED = {
 _running: set[subprocess.Popen[str]] = set()
 
 
-def run_in_own_process(run: Run) -> dict[str, Any]:
-    """The result of a run, or ``{"error": sentence}``; it never raises an exception, so that other runs continue."""
+def run_in_own_process(run: Run, snapshot: Path | None = None) -> dict[str, Any]:
+    """The result of a run, or ``{"error": sentence}``; it never raises an exception, so that other runs continue.
+
+    :param snapshot: where the training is saved every few minutes, and from where it continues after a kill
+    """
     process = subprocess.Popen(
         [sys.executable, "-m", __name__],
         stdin=subprocess.PIPE,
@@ -39,6 +43,7 @@ def run_in_own_process(run: Run) -> dict[str, Any]:
         env=os.environ | SINGLE_THREADED,
         start_new_session=True,  # Ctrl-C reaches the parent alone, which then stops the children
     )
+    request = {"run": run.description(), "began": time.monotonic(), "snapshot": snapshot and str(snapshot)}
     _running.add(process)
     assert process.stdin is not None
     assert process.stdout is not None
@@ -47,7 +52,7 @@ def run_in_own_process(run: Run) -> dict[str, Any]:
     reader = threading.Thread(target=lambda stream: errors.extend(stream), args=(process.stderr,), daemon=True)
     reader.start()
     try:
-        process.stdin.write(json.dumps({"run": run.description(), "began": time.monotonic()}) + "\n")
+        process.stdin.write(json.dumps(request) + "\n")
         process.stdin.flush()
         answer = process.stdout.readline()
         process.stdin.close()
@@ -80,12 +85,13 @@ def main() -> None:
     os.dup2(2, 1)
     request = json.loads(sys.stdin.readline())
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    answer.write(json.dumps(_result(Run(**request["run"]), request["began"])) + "\n")
+    snapshot = request["snapshot"] and Path(request["snapshot"])
+    answer.write(json.dumps(_result(Run(**request["run"]), request["began"], snapshot)) + "\n")
     answer.flush()
     os._exit(0)  # without waiting for libraries to shut down
 
 
-def _result(run: Run, began: float) -> dict[str, Any]:
+def _result(run: Run, began: float, snapshot: Path | None) -> dict[str, Any]:
     import torch as th
 
     from sb3_sap.benchmark.provenance import provenance
@@ -93,7 +99,7 @@ def _result(run: Run, began: float) -> dict[str, Any]:
 
     th.set_num_threads(1)
     try:
-        tables = train_and_evaluate(run, began)
+        tables = train_and_evaluate(run, began, snapshot)
     except Exception as error:
         return {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"}
     return {"run": run.description(), "made": provenance(), **tables}

@@ -16,6 +16,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 INTERVAL = 25
 #: Training steps over which the reward of a point is averaged (Fig. 4a).
 WINDOW = 100
+#: Attributes of a recorder that make up its state.
+RECORDED = ("laps", "times", "curve", "episodes", "_due", "_rewards", "_accuracies", "_length", "_total", "_began")
 TIME_COLUMNS = ["checkpoint", "wall_seconds", "training_seconds", "process_seconds"]
 CURVE_COLUMNS = ["step", "reward", "accuracy", "lowest_accuracy"]
 EPISODE_COLUMNS = ["end", "length", "total_reward", "ended"]
@@ -37,6 +39,15 @@ class Clock:
     def process(self) -> float:
         """Processor seconds of this process."""
         return time.process_time() - self._process
+
+    def state(self) -> tuple[float, float]:
+        """Seconds so far, for :meth:`restore`."""
+        return self.wall(), self.process()
+
+    def restore(self, state: tuple[float, float]) -> None:
+        """Continues from the seconds of an earlier process; those of this one so far do not count."""
+        wall, process = state
+        self._wall, self._process = time.monotonic() - wall, time.process_time() - process
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
@@ -66,8 +77,20 @@ class Recorder(BaseCallback):
         self._accuracies: list[float] = []
         self._length, self._total = 0, 0.0
 
+        self._began: float | None = None
+
+    def state(self) -> dict[str, Any]:
+        """What was recorded so far, for :meth:`restore`."""
+        return {name: getattr(self, name) for name in RECORDED}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from what an earlier process recorded."""
+        for name in RECORDED:
+            setattr(self, name, state[name])
+
     def _on_training_start(self) -> None:
-        self._began = self._clock.wall()
+        if self._began is None:
+            self._began = self._clock.wall()
 
     def _on_rollout_start(self) -> None:
         # The gradient steps of the last rollout are complete by now, which they are not in `_on_step`.
@@ -83,7 +106,7 @@ class Recorder(BaseCallback):
     def _checkpoint(self) -> None:
         checkpoint = self._due.popleft()
         wall = self._clock.wall()
-        times = [wall, wall - self._began, self._clock.process()]
+        times = [wall, wall - (self._began or 0.0), self._clock.process()]
         self.times.append([checkpoint, *(round(seconds, 3) for seconds in times)])
         with self._clock.stopped():
             self.laps += [[checkpoint, *row] for row in self._evaluate(self.model)]

@@ -27,6 +27,11 @@ def run_path(name: str, folder: Path) -> Path:
     return folder / "runs" / f"{name}.json"
 
 
+def snapshot_path(name: str, folder: Path) -> Path:
+    """Where a run in progress is saved; the file is deleted as the run ends."""
+    return (folder / "runs" / f"{name}.snapshot").absolute()
+
+
 def read_result(run: Run, folder: Path) -> dict[str, Any] | None:
     """The result of exactly this run, or None if there is none.
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 
 from sb3_sap.benchmark.episodes import RETURN_COLUMNS, evaluation
 from sb3_sap.benchmark.learners import make_model
@@ -13,16 +15,18 @@ from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.oracle import oracle_episodes
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS, Clock, Recorder
 from sb3_sap.benchmark.runs import Run
+from sb3_sap.benchmark.snapshots import SnapshotCallback, resume
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS, lap, lap_env
 
 LAP_COLUMNS = ["checkpoint", "track", "lap_done", "covered", "total_reward", "score", "steps"]
 
 
-def train_and_evaluate(run: Run, began: float) -> dict[str, Any]:
+def train_and_evaluate(run: Run, began: float, snapshot: Path | None = None) -> dict[str, Any]:
     """Trains, evaluates, and returns the tables of the run as lists, which JSON can hold.
 
     :param began: start of the process in ``time.monotonic`` seconds
+    :param snapshot: where a training in progress is saved every few minutes and continues from; None: nowhere
     """
     clock = Clock(began)
     if run.simulator in ENVIRONMENTS:
@@ -38,13 +42,25 @@ def train_and_evaluate(run: Run, began: float) -> dict[str, Any]:
     else:
         env = make_env(ENVIRONMENTS.get(run.simulator, run.simulator), **run.training)
         model = make_model(run.algo, env, run.settings, run.seed)
-        model.learn(run.steps, callback=recorder)
+        _learn(model, run.steps, recorder, clock, snapshot)
     return {
         "laps": {"columns": columns, "data": recorder.laps},
         "times": {"columns": TIME_COLUMNS, "data": recorder.times},
         "curve": {"columns": CURVE_COLUMNS, "data": recorder.curve},
         "episodes": {"columns": EPISODE_COLUMNS, "data": recorder.episodes},
     }
+
+
+def _learn(model: Any, steps: int, recorder: Recorder, clock: Clock, path: Path | None) -> None:
+    """Trains, from a snapshot if there is one; models of other libraries cannot be saved with their generators."""
+    if path is None or not isinstance(model.policy, th.nn.Module):
+        model.learn(steps, callback=recorder)
+        return
+    snapshots = SnapshotCallback(path, recorder, clock)
+    model = resume(path, model, snapshots, recorder, clock)
+    remaining = steps - model.num_timesteps
+    model.learn(remaining, callback=[recorder, snapshots], reset_num_timesteps=model.num_timesteps == 0)
+    path.unlink(missing_ok=True)
 
 
 def _laps(run: Run) -> Callable[[Any], list[list[Any]]]:

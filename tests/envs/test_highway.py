@@ -221,7 +221,7 @@ def test_unknown_track_is_refused_by_gym_make() -> None:
 
 
 @pytest.mark.slow
-def test_two_thousand_control_steps_a_second() -> None:
+def test_simulator_takes_two_thousand_control_steps_a_second() -> None:
     env = gym.make("sap/LaneKeeping-v0", laps=None)
     obs, _ = env.reset()
     begin = time.process_time()

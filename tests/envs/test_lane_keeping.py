@@ -82,7 +82,7 @@ def test_observation_is_table_1_in_documented_units() -> None:
     assert obs.dtype == np.float32
 
 
-def test_observation_is_clipped_to_its_space() -> None:
+def test_observation_of_extreme_states_is_in_its_space() -> None:
     env = started(CarState(-math.pi, 9.0, 1e6, -1e6, 1e6, 0.0))
     obs, *_ = drive(env)
     assert env.observation_space.contains(obs)
@@ -135,7 +135,7 @@ def test_off_track_reward_can_be_set() -> None:
         LaneKeepingEnv(ScriptedSimulator(), off_track_reward=math.inf)
 
 
-def test_the_edge_itself_is_on_the_road() -> None:
+def test_edge_itself_is_on_the_road() -> None:
     _, reward, terminated, _, info = drive(started(car(track_pos=1.0)))
     assert (reward, terminated, info["off_track"]) == (pytest.approx(0.0), False, False)
 
@@ -153,7 +153,7 @@ def test_moving_again_restarts_the_five_seconds() -> None:
     assert drive(env)[2]
 
 
-def test_a_lap_is_counted_from_where_it_started_and_across_the_line() -> None:
+def test_lap_is_counted_from_where_it_started_and_across_the_line() -> None:
     env = started(
         car(distance=90.0), car(distance=30.0), car(distance=59.0), car(distance=61.0), options={"distance": 60}
     )
@@ -239,7 +239,7 @@ def test_invalid_render_mode_is_refused() -> None:
         LaneKeepingEnv(ScriptedSimulator(), render_mode="ansi")
 
 
-def test_close_closes_the_simulator() -> None:
+def test_closing_the_environment_closes_the_simulator() -> None:
     env = LaneKeepingEnv(simulator := ScriptedSimulator())
     env.close()
     assert simulator.closed

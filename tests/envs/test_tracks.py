@@ -80,7 +80,7 @@ def test_locate_follows_the_given_piece_where_wheel_2_crosses_itself() -> None:
 
 
 @pytest.mark.parametrize("name", TORCS_FIGURES)
-def test_shipped_tracks_have_torcs_own_figures(name: str) -> None:
+def test_shipped_tracks_have_the_figures_of_torcs(name: str) -> None:
     length, width, radius, segments, sub_segments = TORCS_FIGURES[name]
     track = get_track(name)
     assert track.length == pytest.approx(length, abs=0.05)  # TORCS adds up in single precision

@@ -13,6 +13,45 @@ from sb3_sap.guidance.values import q_values
 OBS = np.array([[0.3, 0.1], [-0.2, 0.5]], dtype=np.float32)
 
 
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_each_stratum_of_each_dimension_has_one_candidate(dim):
+    low = np.float32([[-1] * dim, [0] * dim])
+    high = np.float32([[1] * dim, [10] * dim])
+    candidates = stratified_candidates(np.random.default_rng(0), low, high, 16)
+    assert candidates.shape == (2, 16, dim)
+    assert candidates.dtype == np.float32
+    strata = np.floor((candidates - low[:, None]) / (high - low)[:, None] * 16)
+    np.testing.assert_array_equal(np.sort(strata, axis=1), np.broadcast_to(np.arange(16)[:, None], (2, 16, dim)))
+
+
+def test_strata_of_dimensions_and_rows_are_paired_at_random():
+    zeros = np.zeros((2, 2), np.float32)
+    candidates = stratified_candidates(np.random.default_rng(0), zeros, zeros + 1, 1000)
+    for row in candidates:
+        assert abs(np.corrcoef(row.T)[0, 1]) < 0.13  # 4 standard deviations
+    assert abs(np.corrcoef(candidates[0, :, 0], candidates[1, :, 0])[0, 1]) < 0.13
+
+
+def test_candidates_are_uniform_within_the_bounds():
+    low, high = np.float32([[-0.3]]), np.float32([[0.1]])
+    rng = np.random.default_rng(0)
+    draws = np.concatenate([stratified_candidates(rng, low, high, 4).ravel() for _ in range(2000)])
+    assert low <= draws.min() < -0.299
+    assert 0.099 < draws.max() <= high
+    assert np.mean(draws) == pytest.approx(-0.1, abs=0.001)
+    # Each tenth of the interval, across the borders of the quarters, holds a tenth: 800, standard deviation < 27.
+    counts, _ = np.histogram(draws, bins=10, range=(-0.3, 0.1))
+    assert counts == pytest.approx([800] * 10, abs=108)
+
+
+def test_interval_of_one_point_gives_that_point():
+    point = np.float32([[0.125]])
+    assert (stratified_candidates(np.random.default_rng(0), point, point, 5) == point).all()
+
+
+# ---------------------------------------------------------------- line 11
+
+
 def test_choice_is_the_best_or_a_random_permissible_candidate():
     candidates = np.arange(6).reshape(2, 3, 1)
     permissible = np.array([[True, False, True], [False, True, True]])
@@ -66,39 +105,3 @@ def test_unknown_candidate_selection_is_refused():
     with pytest.raises(ValueError, match=r"^`candidate_selection` must be one of 'random', .* but is 'best'"):
         build(SACAP, candidate_selection="best")
     assert SELECTIONS[0] == "random"
-
-
-@pytest.mark.parametrize("dim", [1, 2, 3])
-def test_each_stratum_of_each_dimension_has_one_candidate(dim):
-    low = np.float32([[-1] * dim, [0] * dim])
-    high = np.float32([[1] * dim, [10] * dim])
-    candidates = stratified_candidates(np.random.default_rng(0), low, high, 16)
-    assert candidates.shape == (2, 16, dim)
-    assert candidates.dtype == np.float32
-    strata = np.floor((candidates - low[:, None]) / (high - low)[:, None] * 16)
-    np.testing.assert_array_equal(np.sort(strata, axis=1), np.broadcast_to(np.arange(16)[:, None], (2, 16, dim)))
-
-
-def test_strata_of_dimensions_and_rows_are_paired_at_random():
-    zeros = np.zeros((2, 2), np.float32)
-    candidates = stratified_candidates(np.random.default_rng(0), zeros, zeros + 1, 1000)
-    for row in candidates:
-        assert abs(np.corrcoef(row.T)[0, 1]) < 0.13  # 4 standard deviations
-    assert abs(np.corrcoef(candidates[0, :, 0], candidates[1, :, 0])[0, 1]) < 0.13
-
-
-def test_candidates_are_uniform_within_the_bounds():
-    low, high = np.float32([[-0.3]]), np.float32([[0.1]])
-    rng = np.random.default_rng(0)
-    draws = np.concatenate([stratified_candidates(rng, low, high, 4).ravel() for _ in range(2000)])
-    assert low <= draws.min() < -0.299
-    assert 0.099 < draws.max() <= high
-    assert np.mean(draws) == pytest.approx(-0.1, abs=0.001)
-    # Each tenth of the interval, across the borders of the quarters, holds a tenth: 800, standard deviation < 27.
-    counts, _ = np.histogram(draws, bins=10, range=(-0.3, 0.1))
-    assert counts == pytest.approx([800] * 10, abs=108)
-
-
-def test_interval_of_one_point_gives_that_point():
-    point = np.float32([[0.125]])
-    assert (stratified_candidates(np.random.default_rng(0), point, point, 5) == point).all()

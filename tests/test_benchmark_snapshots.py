@@ -44,9 +44,9 @@ def make(configuration, task="highway", tracks=("eroad",)):
     ("configuration", "task"),
     [
         ("ddpg_ap:fast", "highway"),
-        ("ddpg_ap:paper", "highway"),  # with a noise process
-        ("tqc", "highway"),
-        ("sac_ap:default[n_steps=3,penalty=2.0]", "highway"),
+        pytest.param("ddpg_ap:paper", "highway", marks=pytest.mark.slow),  # with a noise process
+        pytest.param("tqc", "highway", marks=pytest.mark.slow),
+        pytest.param("sac_ap:default[n_steps=3,penalty=2.0]", "highway", marks=pytest.mark.slow),
         ("dqn_ap:task[learning_starts=50,train_freq=4]", "MountainCar-v0"),
     ],
 )

@@ -335,6 +335,7 @@ def test_actions_against_the_motion_are_forbidden_in_mountain_car(monkeypatch):
     assert with_velocity.accuracy > 0.7
 
 
+@pytest.mark.slow
 def test_lane_keeping_forbids_good_actions_near_the_axis():
     """Equation (6) falls short of Definition 3: from the axis itself every motion leads away from it."""
     env = gym.make("sap/LaneKeeping-v0", laps=None)

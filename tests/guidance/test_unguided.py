@@ -76,7 +76,9 @@ def test_unguided_algorithm_equals_its_base_to_the_bit(algorithm, base):
     assert unguided.predictor.fitted
 
 
-@pytest.mark.parametrize("algorithm", GUIDED)
+@pytest.mark.parametrize(
+    "algorithm", [pytest.param(cls, marks=pytest.mark.slow if cls not in (DDPGAP, SACAP) else ()) for cls in GUIDED]
+)
 def test_same_seed_gives_the_same_bits_and_guidance_other_actions(algorithm):
     settings = {"alpha_low": 0.9, "action_noise": Constant(0.0)}
     one, same = (build(algorithm, **settings).learn(150) for _ in range(2))

@@ -40,9 +40,9 @@ def use(copy, program):
 def test_further_base_algorithm_takes_three_edits(copy):
     edit(
         copy / "sb3_sap" / "algorithms.py",
-        "#: Every algorithm by its RL Zoo name.",
+        "#: Every algorithm by its RL Zoo name",
         'class OtherAP(ActionPermissibilityMixin, TD3):\n    """A further base."""\n\n\n'
-        "#: Every algorithm by its RL Zoo name.",
+        "#: Every algorithm by its RL Zoo name",
     )
     edit(
         copy / "sb3_sap" / "algorithms.py", '    "td3_ap": TD3AP,\n', '    "td3_ap": TD3AP,\n    "other_ap": OtherAP,\n'

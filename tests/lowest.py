@@ -21,7 +21,7 @@ import sb3_sap
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.check.check import check_permissibility
 from sb3_sap.cli.main import main
-from sb3_sap.evaluation.plots import plot_permissibility, return_curves, save
+from sb3_sap.plots import plot_permissibility, return_curves, save
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -21,8 +21,8 @@ import sb3_sap
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.check.check import check_permissibility
 from sb3_sap.cli.main import main
-from sb3_sap.plots import plot_permissibility, return_curves, save
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.plots import plot_permissibility, return_curves, save
 
 ROOT = Path(__file__).resolve().parents[1]
 LANE = "sap/LaneKeeping-v0"

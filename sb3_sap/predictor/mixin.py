@@ -111,7 +111,7 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         return cast(KnowledgeMixin, self.replay_buffer).knowledge
 
     def _set_label_source(self, buffer: KnowledgeMixin) -> None:
-        """Sets where a replay buffer takes its labels from."""
+        """Sets where a replay buffer takes its labels from, and what it adds to the reward."""
         potential = None if self.potential is None else resolve(self.potential, "potential")
         own = None if potential is None else does_not_lower(potential)
         buffer.ap_function = own if self.ap_function is None else resolve(self.ap_function, "ap_function")
@@ -122,8 +122,8 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
                 'goal has no label in `info["permissible"]`: pass the AP function itself.'
             )
         buffer.images = self.images
-        # With `permissible_actions` a model may do without labels of executed actions.
-        buffer.needs_labels = getattr(self, "permissible_actions", None) is None
+        # With `permissible_actions` a model may do without labels of executed actions, but a penalty needs them.
+        buffer.needs_labels = self.penalty > 0 or getattr(self, "permissible_actions", None) is None
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)

@@ -21,6 +21,10 @@ def height(obs):
     return 5.0 - np.abs(x[:, 0])
 
 
+def anything(obs, actions):
+    return np.ones(len(actions), dtype=bool)
+
+
 class Ending(Line):
     """A line whose episodes terminate beyond ±0.5 and are truncated after the horizon."""
 
@@ -131,6 +135,12 @@ def test_without_penalty_and_potential_nothing_is_added():
     model.learn(30)
     _, after = positions(model.replay_buffer, 30)
     assert np.array_equal(model.replay_buffer.rewards[:30, 0], np.float32([-abs(float(x)) for x in after]))
+
+
+def test_penalty_without_labels_is_refused_even_if_actions_are_ruled_out_beforehand():
+    model = build(SACAP, Line(labels=False), permissible_actions=anything, penalty=1.0)
+    with pytest.raises(ValueError, match="^There is no AP function"):
+        model.learn(5)
 
 
 def test_saved_model_keeps_penalty_and_potential(tmp_path):

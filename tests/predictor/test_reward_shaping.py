@@ -139,7 +139,7 @@ def test_without_penalty_and_potential_nothing_is_added():
 
 def test_penalty_without_labels_is_refused_even_if_actions_are_ruled_out_beforehand():
     model = build(SACAP, Line(labels=False), permissible_actions=anything, penalty=1.0)
-    with pytest.raises(ValueError, match="^There is no AP function"):
+    with pytest.raises(ValueError, match=r"^There is no AP function"):
         model.learn(5)
 
 

@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.her import HerReplayBuffer
 from torch.nn import functional as F
 
-from sb3_sap import DDPGAP, SACAP, TD3AP, RescaleExtractor, preset, tasks
+from sb3_sap import DDPGAP, DQNAP, SACAP, TD3AP, RescaleExtractor, preset, tasks
 from sb3_sap.evaluation import drive_lap
 from sb3_sap.guidance.values import q_values
 from sb3_sap.predictor.network import query_candidates
+from sb3_sap.presets import load_config, settings_in
 
 
 class Arm(gym.Env[Any, Any]):
@@ -63,12 +66,28 @@ def comes_no_further(obs: Any, actions: Any, next_obs: Any) -> Any:
     return np.linalg.norm(next_obs[:, -2:], axis=1) <= np.linalg.norm(obs[:, -2:], axis=1)
 
 
+def hand_comes_no_further(obs: Any, actions: Any, next_obs: Any) -> Any:
+    """Permissible: the hand is no further from the goal than before, or within the 5 cm that count as success."""
+    before, after = (np.linalg.norm(o["achieved_goal"] - o["desired_goal"], axis=1) for o in (obs, next_obs))
+    return (after <= before) | (after < 0.05)
+
+
+def plain_dqn(env_id: str) -> dict[str, Any]:
+    """The settings of a task's entry without those of guidance, for ten thousand steps."""
+    own = ("ap_function", "actor_permissibility_coef", "refit_growth")
+    return {key: value for key, value in settings_in(load_config("dqn_ap")[env_id]).items() if key not in own}
+
+
 ARM: Any = Arm
 gym.register("Arm-v0", ARM)
 gym.register("Arm4-v0", ARM, kwargs={"joints": 4, "turn": 0.2, "near": 0.2})
 
 LANE = {"env": "sap/TorcsLaneKeeping-v0", "options": {"track": "wheel-2", "laps": None}, "penalty": 50.0, "label": None}
 TUNED_TD3 = {"policy_kwargs": {"net_arch": [128, 256]}, "learning_rate": 0.002, "gamma": 0.95, "tau": 0.01}
+FETCH = {
+    **{"policy_kwargs": {"net_arch": [64, 64]}, "learning_rate": 1e-3, "gamma": 0.95, "tau": 0.02},
+    **{"batch_size": 128, "replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"n_sampled_goal": 4}},
+}
 MCC = {"policy_kwargs": {"net_arch": [64, 64], "features_extractor_class": RescaleExtractor}}
 #: Per task: class, environment, settings of the base, label, penalty c, and the steps after which it is evaluated.
 TASKS: dict[str, dict[str, Any]] = {
@@ -87,6 +106,18 @@ TASKS: dict[str, dict[str, Any]] = {
         **{"env": "Arm4-v0", "class": TD3AP, "settings": {"gamma": 0.9, "learning_rate": 1e-3}, "penalty": 0.05},
         **{"label": comes_no_further, "evaluations": (1000, 2000, 3000)},
     },
+    "mc-dqn": {
+        **{"env": "MountainCar-v0", "class": DQNAP, "settings": plain_dqn("MountainCar-v0"), "penalty": 1.0},
+        **{"label": tasks.mountain_car, "evaluations": (2000, 4000, 6000, 10000)},
+    },
+    "acro-dqn": {
+        **{"env": "Acrobot-v1", "class": DQNAP, "settings": plain_dqn("Acrobot-v1"), "penalty": 1.0},
+        **{"label": tasks.acrobot, "evaluations": (1000, 2000, 4000, 6000, 10000)},
+    },
+    "reach-td3": {
+        **{"env": "FetchReach-v4", "class": TD3AP, "penalty": 0.5, "label": hand_comes_no_further},
+        **{"settings": FETCH, "evaluations": (1000, 2000, 3000, 4000)},
+    },
     "pend-ddpg": {
         **{"env": "Pendulum-v1", "class": DDPGAP, "settings": {"learning_rate": 1e-3}, "penalty": 2.0},
         **{"label": tasks.pendulum_torque, "evaluations": (1000, 2000, 3000, 4000)},
@@ -97,6 +128,7 @@ PREDICTOR = {
     **{"refit_growth": 0.005, "dataset_size": 256, "n_candidates": 32},
     "predictor_kwargs": {"batch_size": 64, "optimizer_kwargs": {"fused": True}},
 }
+DISCRETE = {"actor_permissibility_coef": 1.0, "refit_growth": 0.02, "teaching_growth": 0.0}
 LOSS = {"actor_permissibility_coef": 3.0, "teaching_growth": 0.0}
 #: Per variant: whether E is used at all, α, settings, the penalty as a share of the task's, the coefficient of the loss
 #: within the base's own actor step (`hook`), how actions are replaced (`mode`: "near" the nearest permissible of
@@ -116,11 +148,28 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "hook+pen": {"hook": 1.0, "pen": 1},
     "hook+pen+noise": {"hook": 1.0, "pen": 1, "noise": 0.1},
     "hook3+pen+noise": {"hook": 3.0, "pen": 1, "noise": 0.1},
+    "hookL+pen+noise": {"hook": 1.0, "pen": 1, "noise": 0.1, "fade": 1.0},
+    "hookL+pen4+noise": {"hook": 1.0, "pen": 0.25, "noise": 0.1, "fade": 1.0},
+    "hookL+spread+noise": {"hook": 1.0, "spread": 1.0, "noise": 0.1, "fade": 1.0},
+    "pen4+noise": {"off": True, "pen": 0.25, "noise": 0.1},
+    "spread+noise": {"off": True, "spread": 1.0, "noise": 0.1},
+    "rms+noise": {"off": True, "spread": 1.0, "square": True, "noise": 0.1},
+    "hookL+rms+noise": {"hook": 1.0, "spread": 1.0, "square": True, "noise": 0.1, "fade": 1.0},
+    "rms4+noise": {"off": True, "spread": 0.25, "square": True, "noise": 0.1},
+    "hookH+rms4+noise": {"hook": 1.0, "spread": 0.25, "square": True, "noise": 0.1, "fade": 2.0},
+    "rms": {"off": True, "spread": 1.0, "square": True},
+    "spread3+noise": {"off": True, "spread": 3.0, "noise": 0.1},
     "hookT+pen+noise": {"hook": 1.0, "pen": 1, "noise": 0.1, "trust": True},
     "near+pen+u": {"alpha": 0.9, "pen": 1, "mode": "near", "explore": 0.3},
     "near+pen+u+noise": {"alpha": 0.9, "pen": 1, "mode": "near", "explore": 0.3, "noise": 0.1},
     "hook+near+pen+u": {"alpha": 0.9, "hook": 1.0, "pen": 1, "mode": "near", "explore": 0.3},
     "hook+near+pen+u+noise": {"alpha": 0.9, "hook": 1.0, "pen": 1, "mode": "near", "explore": 0.3, "noise": 0.1},
+    "guided": {"alpha": 0.9},
+    "guided+pen": {"alpha": 0.9, "pen": 1},
+    "loss": {"settings": DISCRETE},
+    "loss+pen": {"settings": DISCRETE, "pen": 1},
+    "guided+loss": {"alpha": 0.9, "settings": DISCRETE},
+    "guided+loss+pen": {"alpha": 0.9, "settings": DISCRETE, "pen": 1},
     "argq": {"alpha": 1.0, "mode": "argq", "explore": 0.3},
     "argq+pen": {"alpha": 1.0, "mode": "argq", "pen": 1, "explore": 0.3},
     "argqT+pen": {"alpha": 1.0, "mode": "argq", "explore": 0.3, "target": True, "pen": 1},
@@ -143,10 +192,28 @@ def prototype(base: Any, variant: dict[str, Any]) -> Any:
                 return drawn
 
             self.replay_buffer.sample = remember
+            if variant.get("spread"):
+                self._scale_penalty()
             if variant.get("hook"):
                 self.actor.optimizer.register_step_pre_hook(self._add_loss)
             if variant.get("target"):
                 self._choose_next_actions()
+
+        def _scale_penalty(self) -> None:
+            """Lets the penalty follow the standard deviation of the rewards so far, or their root mean square."""
+            add, rewards = self.replay_buffer.add, [0.0, 0.0, 0.0]
+
+            def scaled(obs: Any, next_obs: Any, action: Any, reward: Any, *args: Any, **kwargs: Any) -> None:
+                for value in reward:
+                    rewards[0] += 1
+                    rewards[1] += float(value)
+                    rewards[2] += float(value) ** 2
+                mean = 0.0 if variant.get("square") else rewards[1] / rewards[0]
+                c = variant["spread"] * (max(0.0, rewards[2] / rewards[0] - mean**2) ** 0.5 or 1.0)
+                self.replay_buffer.shaping = replace(self.replay_buffer.shaping, penalty=c)
+                add(obs, next_obs, action, reward, *args, **kwargs)
+
+            self.replay_buffer.add = scaled
 
         def _mean_action(self, obs: Any) -> Any:
             self.actor.set_training_mode(False)
@@ -178,6 +245,9 @@ def prototype(base: Any, variant: dict[str, Any]) -> Any:
             self.hooked += 1
             loss = F.softplus(-self.predictor(self.batch, self._mean_action(self.batch))).mean()
             loss = loss * variant["hook"] * self.spread
+            if variant.get("fade"):
+                done = 1 - self._current_progress_remaining
+                loss = loss * max(0.0, 1 - variant["fade"] * done)
             if variant.get("trust"):
                 loss = loss * max(0.0, 1 - 2 * self.preferred_mistakes)
             parameters = [p for p in self.actor.parameters() if p.requires_grad]
@@ -261,15 +331,20 @@ def build(task: dict[str, Any], variant: dict[str, Any], seed: int) -> Any:
     own = {"refit_growth": 0.5} if variant.get("off") else {**PREDICTOR, **variant.get("settings", {})}
     settings = {**task["settings"], **own, "alpha": alpha, "alpha_low": min(alpha, 0.5)}
     settings |= {"penalty": variant.get("pen", 0) * task["penalty"], "ap_function": task["label"]}
+    if task["env"].startswith("Fetch"):
+        import gymnasium_robotics
+
+        gym.register_envs(gymnasium_robotics)
     env = gym.make(task["env"], **task.get("options", {}))
-    return prototype(task["class"], variant)("MlpPolicy", env, seed=seed, device="cpu", **settings)
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    return prototype(task["class"], variant)(policy, env, seed=seed, device="cpu", **settings)
 
 
 def evaluate(model: Any, task: dict[str, Any]) -> list[float]:
     """S of two unseen tracks, the share of thirty episodes that end in success, or the mean return of five episodes."""
     if "Lane" in task["env"]:
         return [drive_lap(model, track, "torcs").score for track in ("eroad", "g-track-3")]
-    env, arm = gym.make(task["env"]), "Arm" in task["env"]
+    env, arm = gym.make(task["env"]), task["env"].startswith(("Arm", "Fetch"))
     values = []
     for seed in range(30 if arm else 5):
         obs, _ = env.reset(seed=10_000 + seed)

@@ -20,6 +20,7 @@ from sb3_sap.common.extractors import RescaleExtractor
 from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.guidance.wrapper import LearnedPermissibility
 from sb3_sap.permissibility import ActionPermissibility, does_not_lower
 from sb3_sap.predictor.buffers import (
     KnowledgeMixin,
@@ -33,6 +34,16 @@ from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
 from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.presets import preset
+
+
+def __getattr__(name: str) -> object:
+    """``compare``, which is imported only when it is used, because it needs the libraries of an extra."""
+    if name != "compare":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from sb3_sap.comparison import compare
+
+    return compare
+
 
 __version__ = "0.1.0"
 __all__ = [
@@ -53,6 +64,7 @@ __all__ = [
     "GuidedPolicy",
     "KnowledgeBuffer",
     "KnowledgeMixin",
+    "LearnedPermissibility",
     "LearnedPermissibilityMixin",
     "PermissibilityCallback",
     "PermissibilityDictReplayBuffer",
@@ -63,6 +75,7 @@ __all__ = [
     "PermissibilityReport",
     "RescaleExtractor",
     "check_permissibility",
+    "compare",
     "does_not_lower",
     "envs",
     "preset",

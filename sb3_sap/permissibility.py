@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_sap.common.arrays import BoolArray, FloatArray, Observations, copy_observation
-from sb3_sap.common.reward_shaping import PotentialError, RewardShaping, query_potential
+from sb3_sap.common.reward_shaping import PotentialError, RewardScale, RewardShaping, query_potential
 
 
 class APFunction(Protocol):
@@ -37,17 +37,18 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
     :param env: the environment to wrap
     :param permissible: f(s, a | s') of one step: ``permissible(obs, action, next_obs) -> bool``; ``None``: the
         environment's own ``info["permissible"]``
-    :param penalty: c, subtracted from the reward of a non-permissible action
+    :param penalty: c, subtracted from the reward of a non-permissible action; ``"auto"``: the root mean square of the
+        rewards so far, ``"auto_0.5"``: half of it
     """
 
     def __init__(
         self,
         env: gym.Env[Any, Any],
         permissible: Callable[[Any, Any, Any], bool] | None = None,
-        penalty: float = 0.0,
+        penalty: float | str = 0.0,
     ):
         super().__init__(env)
-        self.shaping = RewardShaping(penalty)
+        self.shaping, self.reward_scale = RewardShaping(penalty), RewardScale()
         if not (permissible is None or callable(permissible)):
             raise TypeError(
                 "`permissible` must be a function (obs, action, next_obs) -> bool of one step, "
@@ -66,7 +67,10 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
         if self.permissible is not None:
             info = {**info, "permissible": self.permissible(self._obs, action, next_obs)}
         if self.shaping:
-            reward = float(reward) - self.shaping.penalty * ~labels_from_infos([info])[0]
+            reward = float(reward)
+            self.reward_scale.update(reward)
+            if not labels_from_infos([info])[0]:
+                reward -= self.shaping.penalty_at(float(self.reward_scale))
         self._obs = copy_observation(next_obs)
         return next_obs, reward, terminated, truncated, info
 

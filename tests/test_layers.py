@@ -15,6 +15,7 @@ PACKAGE = Path(sb3_sap.__file__).parent
 # below; the environments and their tasks are separate layers, which only the upper layers know.
 LAYERS = (
     {"cli"},
+    {"comparison"},
     {"zoo", "benchmark"},
     {"plots", "evaluation"},
     {"presets"},
@@ -25,7 +26,7 @@ LAYERS = (
     {"common"},
 )
 ENVIRONMENT_LAYERS = ({"tasks"}, {"envs"})
-MAY_KNOW_ENVIRONMENTS = {"cli", "zoo", "benchmark", "evaluation", "plots"}
+MAY_KNOW_ENVIRONMENTS = {"cli", "comparison", "zoo", "benchmark", "evaluation", "plots"}
 # The modules of lower layers that environments and tasks may import: those of NumPy and the standard library alone.
 ENVIRONMENTS_MAY_IMPORT = {
     "sb3_sap.common.arrays",

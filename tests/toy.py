@@ -91,6 +91,12 @@ def towards_centre(obs: Any, actions: Any, next_obs: Any) -> Any:
     return (np.abs(next_x) <= np.abs(x))[:, 0]
 
 
+def centred(obs: Any) -> Any:
+    """A potential of :class:`Line`: the AP function above permits what does not lower it."""
+    x = obs["x"] if isinstance(obs, dict) else obs[:, :1]
+    return -np.abs(x)[:, 0].astype(float)
+
+
 def nearby(obs: Any, previous_obs: Any, last_action: Any) -> tuple[Any, Any]:
     """A stub constraint: within 0.5 of the previous action."""
     return last_action - 0.5, last_action + 0.5

@@ -31,6 +31,7 @@ REPORTS = {
     "details": (["details"], "summary of details that the paper leaves open, one changed at a time"),
     "auxiliary": (["auxiliary"], "summary of how often the auxiliary actor loss is applied"),
     "robustness": (["robustness"], "summary at 80 km/h and from random starts, for which nothing was tuned"),
+    "rivals": (["rivals"], "the recommended settings, a reward penalty with the same label, and the base"),
 }
 #: Reports that are summaries of other configurations.
 SUMMARIES = ("summary", "ablations", "details", "auxiliary", "robustness")
@@ -58,7 +59,7 @@ def task(options: argparse.Namespace, console: Console) -> int:
     options.steps = options.steps or planned_steps(options.simulator)
     options.configurations = options.configurations or task_configurations(options.simulator)
     failed = _run_missing(options, options.steps, console)
-    _write(options, "returns", console)
+    _write(options, options.report, console)
     return int(failed > 0)
 
 
@@ -108,7 +109,7 @@ def _run_missing(options: argparse.Namespace, steps: int, console: Console) -> i
 
 
 def _write(options: argparse.Namespace, name: str, console: Console, leave_out_unknown: bool = False) -> None:
-    from sb3_sap.benchmark.reports import figures, returns, summary, tables
+    from sb3_sap.benchmark.reports import figures, returns, rivals, summary, tables
     from sb3_sap.benchmark.reports.results import collect
 
     folder = _folder(options, options.steps)
@@ -122,6 +123,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, leave_out_u
         "headline": tables.headline,
         **{kind: partial(summary.summary, name=kind) for kind in SUMMARIES},
         "returns": returns.returns,
+        "rivals": rivals.rivals,
     }
     writers[name](results, folder, command_line(options, name))
     console.print(f"wrote {folder / name}.md", soft_wrap=True)
@@ -177,12 +179,13 @@ def _folder(options: argparse.Namespace, steps: int) -> Path:
 
 def command_line(options: argparse.Namespace, name: str) -> str:
     """The command that makes a report, without the flags that do not change it."""
-    beyond = name == "returns"
+    beyond = options.simulator not in ENVIRONMENTS
     words = ["sb3-sap", "benchmark", *(["task"] if beyond else [name, "--simulator"]), options.simulator]
+    words += ["--report", name] if beyond and name != "returns" else []
     words += [] if name == "claims" else ["--steps", str(options.steps)]
     words += ["--seeds", str(options.seeds)]
     words += ["--first-seed", str(options.first_seed)] if options.first_seed else []
-    default = REPORTS[name][0] if name in REPORTS else ["paper"]
+    default = REPORTS[name][0] if name in REPORTS and not beyond else ["paper"]
     words += ["--configurations", *options.configurations] if options.configurations != default else []
     words += ["--tracks", *options.tracks] if not beyond and options.tracks != list(TEST_TRACKS) else []
     return shlex.join(words)

@@ -1,4 +1,7 @@
-"""Configurations, such as ``ddpg_ap:paper[alpha=0.5]``: an algorithm, a preset, and overrides of its settings."""
+"""Configurations, such as ``ddpg_ap:paper[alpha=0.5]``: an algorithm, a preset, and overrides of its settings.
+
+Presets may be joined, as in ``ddpg_ap:base+recommended``: later ones override earlier ones.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ import yaml
 from sb3_sap.benchmark.groups import GROUPS
 
 #: ``algo``, ``algo:preset`` or ``algo:preset[key=value,…]``.
-_CONFIGURATION = re.compile(r"(?P<algo>\w+)(:(?P<preset>\w+))?(\[(?P<overrides>.+)\])?")
+_CONFIGURATION = re.compile(r"(?P<algo>\w+)(:(?P<preset>\w+(\+\w+)*))?(\[(?P<overrides>.+)\])?")
 
 #: Controllers that do not learn and have no presets: linear feedback and the look-ahead oracle.
 CONTROLLERS = ("linear", "oracle")

@@ -72,5 +72,18 @@ GROUPS: dict[str, list[str]] = {
         ),
         "linear[env.speed=80]",
     ],
+    # The recommended settings, and what a good engineer would try in one line: a penalty that was tuned for lane
+    # keeping (c = 50), the same penalty for all tasks, and none.
+    "rivals": [
+        f"{algo}:{presets}"
+        for algo in ("ddpg_ap", "td3_ap", "sac_ap", "tqc_ap")
+        for presets in (
+            "base+penalty[penalty=0]",
+            "base+penalty[penalty=50]",
+            "base+penalty",
+            "base+recommended",
+            "fast",
+        )
+    ],
 }
 GROUPS["all"] = [*PAPER, *GROUPS["guided"], *GROUPS["baselines"], *GROUPS["sbx"], "linear"]

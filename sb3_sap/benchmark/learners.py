@@ -11,7 +11,7 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_sap.algorithms import ALGORITHMS
+from sb3_sap.algorithms import ALGORITHMS, base_of
 from sb3_sap.benchmark.configurations import CONTROLLERS, Configuration, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
 from sb3_sap.benchmark.task_settings import entry, task_settings
@@ -81,10 +81,14 @@ def settings_of(configuration: Configuration, simulator: str, steps: int) -> dic
     else:
         known = set(inspect.signature(algorithm_class(configuration.algo)).parameters)
         namesake = plain_name(configuration.algo)
-        if simulator in ENVIRONMENTS:
-            base = preset(configuration.preset, namesake, steps)
-        else:
-            base = task_settings(namesake, configuration.preset, simulator, known)
+        base = {}
+        for name in configuration.preset.split("+"):
+            if simulator not in ENVIRONMENTS:
+                base |= task_settings(namesake, name, simulator, known)
+            elif name == "base":
+                base |= preset("tuned", base_of(namesake), steps)
+            else:
+                base |= preset(name, namesake, steps)
         if configuration.algo.startswith("sbx_"):
             base = _for_sbx(base)
     settings = copy.deepcopy(base)

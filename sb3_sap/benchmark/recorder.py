@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
+
 #: Training steps between two points of a curve.
 INTERVAL = 25
 #: Training steps over which the reward of a point is averaged (Fig. 4a).
@@ -19,7 +21,8 @@ WINDOW = 100
 #: Attributes of a recorder that make up its state.
 RECORDED = ("laps", "times", "curve", "episodes", "_due", "_rewards", "_accuracies", "_length", "_total", "_began")
 TIME_COLUMNS = ["checkpoint", "wall_seconds", "training_seconds", "process_seconds"]
-CURVE_COLUMNS = ["step", "reward", "accuracy", "lowest_accuracy"]
+#: ``mistakes`` counts the non-permissible actions so far; it is missing where nothing is labelled, and in older runs.
+CURVE_COLUMNS = ["step", "reward", "accuracy", "lowest_accuracy", "mistakes"]
 EPISODE_COLUMNS = ["end", "length", "total_reward", "ended"]
 
 
@@ -131,7 +134,8 @@ class Recorder(BaseCallback):
         known = [accuracy for accuracy in self._accuracies if not np.isnan(accuracy)]
         self._accuracies = []
         accuracy = [round(sum(known) / len(known), 4), round(min(known), 4)] if known else [None, None]
-        self.curve.append([self.num_timesteps, round(sum(self._rewards) / len(self._rewards), 3), *accuracy])
+        mistakes = self.model.knowledge.seen[0] if isinstance(self.model, LearnedPermissibilityMixin) else None
+        self.curve.append([self.num_timesteps, round(sum(self._rewards) / len(self._rewards), 3), *accuracy, mistakes])
 
 
 def how_ended(info: dict[str, Any]) -> str:

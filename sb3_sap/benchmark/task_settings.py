@@ -6,11 +6,17 @@ the score of an episode is its return.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS, base_of, is_guided
 from sb3_sap.common.errors import nearest
-from sb3_sap.presets import algorithms, load_config, settings_in
+from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.presets import algorithms, load_config, preset_names, settings_in
+from sb3_sap.presets import preset as settings_of_preset
 
 #: Seeds of the evaluation episodes, the same in every run.
 EPISODES = tuple(map(str, range(10_000, 10_010)))
@@ -20,6 +26,12 @@ EVALUATIONS = 20
 LONGER = 10
 #: Number of seeds of such a baseline.
 FEWER = 3
+#: Mean returns that count as a task's goal where the environment names none, or one that takes long to reach.
+GOALS = {"Pendulum-v1": -200.0, "Acrobot-v1": -100.0, "MountainCarContinuous-v0": 90.0, "MountainCar-v0": -110.0}
+#: Settings of guided algorithms that say how labels are used, and not what they are.
+GUIDANCE = (
+    set(inspect.signature(ActionPermissibilityMixin).parameters) - set(inspect.signature(OffPolicyAlgorithm).parameters)
+) - {"ap_function", "potential", "constraint", "permissible_actions", "actor_learning_rate"}
 
 
 def guided_algorithms(env_id: str) -> list[str]:
@@ -68,7 +80,8 @@ def task_settings(algo: str, preset: str, env_id: str, known: set[str]) -> dict[
     """Constructor arguments for a task.
 
     :param preset: "default", the library's defaults; "task", the entry of the guided algorithm, without what an
-        unguided base does not know; "tuned", RL Zoo's settings of the base
+        unguided base does not know; "base", the same for a guided algorithm, with the label but without guidance;
+        "tuned", RL Zoo's settings of the base; or a preset of the algorithm
     :param known: parameters of the constructor
     :raise ValueError: if the algorithm has no such preset for the environment
     """
@@ -77,6 +90,10 @@ def task_settings(algo: str, preset: str, env_id: str, known: set[str]) -> dict[
     if preset == "task":
         settings = settings_in(entry(algo, env_id))
         return settings if is_guided(algo) else {key: value for key, value in settings.items() if key in known}
+    if preset == "base" and is_guided(algo):
+        return {key: value for key, value in settings_in(entry(algo, env_id)).items() if key not in GUIDANCE}
+    if preset in preset_names(algo):
+        return settings_of_preset(preset, algo)
     tuned = load_config(algo).get(env_id) if not is_guided(algo) and algo in algorithms() else None
     if preset != "tuned" or tuned is None:
         raise ValueError(
@@ -88,3 +105,16 @@ def task_settings(algo: str, preset: str, env_id: str, known: set[str]) -> dict[
 def evaluations(steps: int) -> list[int]:
     """Training steps after which the actor is evaluated."""
     return sorted({*range(steps // EVALUATIONS, steps, max(1, steps // EVALUATIONS)), steps} - {0})
+
+
+def target_return(env_id: str) -> float:
+    """The mean return from which a task counts as learned.
+
+    :raise ValueError: if neither `GOALS` nor the environment names one
+    """
+    if env_id in GOALS:
+        return GOALS[env_id]
+    threshold = gym.spec(env_id).reward_threshold
+    if threshold is None:
+        raise ValueError(f"{env_id} names no return from which it is solved: add it to `GOALS`.")
+    return float(threshold)

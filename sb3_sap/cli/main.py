@@ -12,6 +12,7 @@ from rich.console import Console
 import sb3_sap
 from sb3_sap import zoo
 from sb3_sap.benchmark.cli import add_benchmark
+from sb3_sap.cli.compare import add_compare
 from sb3_sap.cli.demo import add_demo
 from sb3_sap.cli.evaluate import add_evaluate
 from sb3_sap.cli.hub import add_push_to_hub
@@ -43,6 +44,7 @@ def parser() -> argparse.ArgumentParser:
     root.add_argument("--version", action="version", version=f"%(prog)s {sb3_sap.__version__}")
     commands = root.add_subparsers(title="commands", required=True, metavar="COMMAND")
     add_demo(commands)
+    add_compare(commands)
     add_evaluate(commands)
     add_benchmark(commands)
     add_torcs(commands)

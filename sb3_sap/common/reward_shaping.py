@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -10,6 +12,9 @@ import numpy as np
 
 from sb3_sap.common.arrays import BoolArray, FloatArray, Observations, copy_observation
 from sb3_sap.common.errors import is_number
+
+#: SB3's notation for a coefficient that is set from what is observed.
+_AUTO = re.compile(r"auto(_\d+\.?\d*)?")
 
 
 class Potential(Protocol):
@@ -26,6 +31,22 @@ class PotentialError(ValueError):
     """A potential raised an error, or returned something other than a finite number for each state."""
 
 
+class RewardScale:
+    """How large the rewards of the environment have been: the root of their mean square, or 1 while all are 0."""
+
+    def __init__(self) -> None:
+        self._count, self._squares = 0, 0.0
+
+    def update(self, rewards: Any) -> None:
+        """Takes in rewards, (n,)."""
+        rewards = np.asarray(rewards, dtype=np.float64)
+        self._count += rewards.size
+        self._squares += float((rewards**2).sum())
+
+    def __float__(self) -> float:
+        return math.sqrt(self._squares / self._count) if self._squares else 1.0
+
+
 @dataclass(frozen=True)
 class RewardShaping:
     """The difference between the reward that is learned from and the reward of the environment.
@@ -34,25 +55,48 @@ class RewardShaping:
     γ Φ(s') - Φ(s), does not (Ng, Harada and Russell 1999), provided that Φ of a terminal state is 0 while a truncated
     episode bootstraps from its last state (Grześ 2017).
 
-    :param penalty: c, subtracted where the action was not permissible
+    :param penalty: c, subtracted where the action was not permissible; ``"auto"``: as much as the rewards are large
+        (:class:`RewardScale`), ``"auto_0.5"``: half as much
     :param potential: Φ, a :class:`Potential`
     :param gamma: γ of the algorithm
     """
 
-    penalty: float = 0.0
+    penalty: float | str = 0.0
     potential: Potential | None = None
     gamma: float = 0.99
 
     def __post_init__(self) -> None:
-        if not (is_number(self.penalty) and 0 <= self.penalty < np.inf):
-            raise ValueError(f"`penalty` must be a number of at least 0, but is {self.penalty!r}.")
+        named = isinstance(self.penalty, str) and _AUTO.fullmatch(self.penalty)
+        if not (named or (is_number(self.penalty) and 0 <= float(self.penalty) < np.inf)):
+            raise ValueError(
+                f'`penalty` must be a number of at least 0, "auto" or "auto_<number>", but is {self.penalty!r}.'
+            )
+
+    @property
+    def penalises(self) -> bool:
+        """Whether there is a penalty."""
+        return isinstance(self.penalty, str) or self.penalty > 0
 
     def __bool__(self) -> bool:
         """Whether there is any difference."""
-        return self.penalty > 0 or self.potential is not None
+        return self.penalises or self.potential is not None
+
+    def penalty_at(self, scale: float) -> float:
+        """c in units of the reward.
+
+        :param scale: how large the rewards are
+        """
+        if not isinstance(self.penalty, str):
+            return float(self.penalty)
+        return scale * float(self.penalty.removeprefix("auto").removeprefix("_") or 1)
 
     def difference(
-        self, labels: BoolArray | None, obs: Observations, next_obs: Observations, terminal: BoolArray
+        self,
+        labels: BoolArray | None,
+        obs: Observations,
+        next_obs: Observations,
+        terminal: BoolArray,
+        scale: float = 1.0,
     ) -> FloatArray:
         """What is added to the rewards of n transitions.
 
@@ -60,11 +104,12 @@ class RewardShaping:
         :param obs: s, raw, (n, *obs_shape)
         :param next_obs: s', raw, (n, *obs_shape)
         :param terminal: (n,) True where the episode terminated, False where it goes on or was truncated
+        :param scale: how large the rewards are, for a penalty of ``"auto"``
         :return: (n,)
         """
         added = np.zeros(len(terminal))
         if labels is not None:
-            added -= self.penalty * ~labels
+            added -= self.penalty_at(scale) * ~labels
         if self.potential is not None:
             later, now = (query_potential(self.potential, o, len(terminal)) for o in (next_obs, obs))
             added += self.gamma * np.where(terminal, 0.0, later) - now

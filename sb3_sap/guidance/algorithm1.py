@@ -23,7 +23,8 @@ from sb3_sap.predictor.network import query_candidates
 class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):
     """Explores with the AP predictor E (Algorithm 1).
 
-    :param alpha: α, probability of querying E once it is accurate enough
+    :param alpha: α, probability of querying E once it is accurate enough; with 0 the base algorithm explores, with its
+        own noise, throughout
     :param alpha_low: the same while E's balanced validation accuracy is below 70 % (the paper gives no value)
     :param t_k: timesteps with noise and without guidance, counted over the model's whole life, the uniform random
         steps of ``learning_starts`` included. ``None``: ``learning_starts``
@@ -60,7 +61,7 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
         """The actions a_t of all environments, in their units and scaled, each (n_envs, *action_shape)."""
-        if self.lifetime_steps < self.noise_steps:
+        if self.lifetime_steps < self.noise_steps or self.alpha == 0:
             # The base algorithm explores: a_t = μ(s_t) + N_t                                  # lines 1-4
             return super()._sample_action(learning_starts, action_noise, n_envs)
         if self.guidance_ended:  # beyond the paper

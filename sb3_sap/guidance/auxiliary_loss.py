@@ -35,17 +35,22 @@ def permissible_actor_step(
     :return: the loss before the step
     """
     observations = replay_buffer.sample(batch_size, env=env).observations
-    # An extra pass must not move running statistics (CrossQ's batch renormalisation).
-    actor.set_training_mode(False)
-    stochastic = hasattr(actor, "action_log_prob")
-    actions: th.Tensor = actor(observations, deterministic=True) if stochastic else actor(observations)
-    loss = coef * F.softplus(-predictor(observations, actions)).mean()
+    loss = coef * F.softplus(-predictor(observations, mean_action(actor, observations))).mean()
     actor.optimizer.zero_grad()
     trained = [parameter for parameter in actor.parameters() if parameter.requires_grad]  # some may be frozen
     if trained:
         loss.backward(inputs=trained)  # type: ignore[no-untyped-call]
     actor.optimizer.step()
     return loss.item()
+
+
+def mean_action(actor: Any, observations: Any) -> th.Tensor:
+    """(n, action_dim) scaled actions of an actor in evaluation mode; of a stochastic one, its mean actions."""
+    # An extra pass must not move running statistics (CrossQ's batch renormalisation).
+    actor.set_training_mode(False)
+    stochastic = hasattr(actor, "action_log_prob")
+    actions: th.Tensor = actor(observations, deterministic=True) if stochastic else actor(observations)
+    return actions
 
 
 @flush_denormals()
@@ -57,7 +62,23 @@ def permissible_value_step(
     batch_size: int,
     env: VecNormalize | None = None,
 ) -> float:
-    """One gradient step of the Q-values on β · softplus(Q(s, a) − Q(s, b)), for discrete actions.
+    """One gradient step of the Q-values on β times :func:`preference_loss`.
+
+    :param model: DQN or QR-DQN
+    :return: the loss before the step; 0 if in no state E rejects some actions and permits others
+    """
+    observations = replay_buffer.sample(batch_size, env=env).observations
+    loss = coef * preference_loss(model, predictor, observations)
+    if not loss.requires_grad:
+        return 0.0
+    model.policy.optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    model.policy.optimizer.step()
+    return loss.item()
+
+
+def preference_loss(model: Any, predictor: PermissibilityPredictor, observations: Any) -> th.Tensor:
+    """softplus(Q(s, a) − Q(s, b)) on average, for discrete actions.
 
     a is each action that E rejects, b the action of highest value that E permits: the loss is the cross-entropy of
     preferring b to a. Experience never corrects the values of actions that guidance prevents: with negative rewards,
@@ -65,9 +86,8 @@ def permissible_value_step(
     is free. Both values have a gradient, because lowering one alone would lower all that share its features, for ever.
 
     :param model: DQN or QR-DQN
-    :return: the loss before the step; 0 if in no state E rejects some actions and permits others
+    :return: the loss; 0 without a gradient if in no state E rejects some actions and permits others
     """
-    observations = replay_buffer.sample(batch_size, env=env).observations
     model.policy.set_training_mode(False)
     values = action_values(model, observations)  # (n, k)
     n, k = values.shape
@@ -78,9 +98,5 @@ def permissible_value_step(
     best = values.masked_fill(rejected, -th.inf).max(dim=1, keepdim=True).values
     separated = rejected & best.isfinite()
     if not separated.any():
-        return 0.0
-    loss = coef * F.softplus(values - best)[separated].mean()
-    model.policy.optimizer.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
-    model.policy.optimizer.step()
-    return loss.item()
+        return th.zeros(())
+    return F.softplus(values - best)[separated].mean()

@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 
 from sb3_sap.guidance.action_filter import guided_prediction
-from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
+from sb3_sap.guidance.permissibility_loss import PermissibilityLossMixin
 
 
-class ActionPermissibilityMixin(AuxiliaryLossMixin):
+class ActionPermissibilityMixin(PermissibilityLossMixin):
     """Guides an SB3 off-policy algorithm with a learned AP predictor (Algorithm 1).
 
     Goes before the algorithm in the bases of a class. Each class of the chain has one task and calls the next::
 
         ActionPermissibilityMixin    predict(guided=True)
-        AuxiliaryLossMixin           the auxiliary loss of the actor or the Q-values
+        PermissibilityLossMixin      a loss on E within the updates of the actor or the Q-values
+        AuxiliaryLossMixin           the same with updates of its own
         GuidedExplorationMixin       Algorithm 1
         LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E
         WatchedEnvironmentMixin      raw last observations, warnings about the training environment
@@ -30,6 +31,7 @@ class ActionPermissibilityMixin(AuxiliaryLossMixin):
     what was learned; both buffers store the executed action.
 
     The parameters are those of :class:`~sb3_sap.guidance.algorithm1.GuidedExplorationMixin`,
+    :class:`~sb3_sap.guidance.permissibility_loss.PermissibilityLossMixin`,
     :class:`~sb3_sap.guidance.auxiliary_update.AuxiliaryLossMixin`,
     :class:`~sb3_sap.predictor.mixin.LearnedPermissibilityMixin`,
     :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin` and

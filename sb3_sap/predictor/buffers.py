@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_sap.common.reward_shaping import RewardShaping
+from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
 from sb3_sap.common.vec_envs import RAW_LAST, environment_layout
 from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
@@ -43,6 +43,8 @@ class KnowledgeMixin(ReplayBuffer):
         self.knowledge = knowledge
         self.ap_function = ap_function
         self.shaping = RewardShaping()
+        #: Of the environment's own rewards, saved with the buffer.
+        self.reward_scale = RewardScale()
 
     def add(
         self,
@@ -66,10 +68,11 @@ class KnowledgeMixin(ReplayBuffer):
             labels = None
         if labels is not None:
             self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
+        self.reward_scale.update(reward)
         if self.shaping:
             truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
             terminal = np.asarray(done, dtype=bool) & ~truncated
-            reward = reward + self.shaping.difference(labels, before, after, terminal)
+            reward = reward + self.shaping.difference(labels, before, after, terminal, float(self.reward_scale))
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -117,7 +120,7 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
             actions = self._unscale(raw.actions.cpu().numpy())
             labels = query_labels(self.ap_function, "ap_function", before, actions, after)
         terminal = raw.dones.cpu().numpy().ravel() > 0
-        added = self.shaping.difference(labels, before, after, terminal).reshape(-1, 1)
+        added = self.shaping.difference(labels, before, after, terminal, float(self.reward_scale)).reshape(-1, 1)
         rewards = self._normalize_reward((raw.rewards.cpu().numpy() + added).astype(np.float32), env)
         return raw._replace(
             observations={key: self.to_torch(value) for key, value in _normalized(self, obs, env).items()},

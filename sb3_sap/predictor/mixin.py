@@ -34,7 +34,8 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
     :param ap_function: f(s, a | s'), an :class:`~sb3_sap.permissibility.APFunction` or its dotted name. ``None``:
         the labels come from ``potential`` if there is one, else from ``info["permissible"]``
     :param penalty: c, subtracted from the reward of a non-permissible action in the replay buffer alone: logged returns
-        and evaluations have the reward of the environment
+        and evaluations have the reward of the environment. ``"auto"``: the root mean square of the rewards so far,
+        ``"auto_0.5"``: half of it
     :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
         to the reward in the replay buffer alone, and without an ``ap_function`` an action is permissible if it does
         not lower Φ
@@ -56,7 +57,7 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         self,
         *args: Any,
         ap_function: APFunction | str | None = None,
-        penalty: float = 0.0,
+        penalty: float | str = 0.0,
         potential: Potential | str | None = None,
         knowledge_buffer_size: int = 10_000,
         validation_fraction: float = 0.1,
@@ -116,14 +117,14 @@ class LearnedPermissibilityMixin(WatchedEnvironmentMixin):
         own = None if potential is None else does_not_lower(potential)
         buffer.ap_function = own if self.ap_function is None else resolve(self.ap_function, "ap_function")
         buffer.shaping = RewardShaping(self.penalty, potential, self.gamma)
-        if self.penalty and buffer.ap_function is None and isinstance(buffer, HerReplayBuffer):
+        if buffer.shaping.penalises and buffer.ap_function is None and isinstance(buffer, HerReplayBuffer):
             raise ValueError(
-                f"`penalty` = {self.penalty} needs an `ap_function` beside {type(buffer).__name__}, for a hindsight "
+                f"`penalty` = {self.penalty!r} needs an `ap_function` beside {type(buffer).__name__}, for a hindsight "
                 'goal has no label in `info["permissible"]`: pass the AP function itself.'
             )
         buffer.images = self.images
         # With `permissible_actions` a model may do without labels of executed actions, but a penalty needs them.
-        buffer.needs_labels = self.penalty > 0 or getattr(self, "permissible_actions", None) is None
+        buffer.needs_labels = buffer.shaping.penalises or getattr(self, "permissible_actions", None) is None
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)

@@ -50,7 +50,7 @@ def test_unguided_ddpg_equals_that_of_sb3_to_the_bit(algorithm, make_env):
 
     runs, torch_states = [], []
     for cls in (stable_baselines3.DDPG, algorithm):
-        extra = {"alpha": 0.0, "t_k": 1000} if cls is DDPGAP else {}
+        extra = {"alpha": 0.0} if cls is DDPGAP else {}
         runs.append(build(cls, make_env(), action_noise=noise(), **extra).learn(150))
         torch_states.append(th.get_rng_state())
     assert_same_to_the_bit(*runs)

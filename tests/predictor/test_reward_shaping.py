@@ -10,7 +10,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import DISCRETE, GUIDED, Line, build, towards_centre
 
 from sb3_sap import DDPGAP, SACAP, ActionPermissibility, check_permissibility, does_not_lower
-from sb3_sap.common.reward_shaping import RewardShaping
+from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
 
 GAMMA = 0.9
 
@@ -46,6 +46,24 @@ def test_replay_buffer_holds_the_reward_less_the_penalty_of_mistakes(algorithm):
     mistakes = np.abs(after) > np.abs(before)
     assert 0 < mistakes.sum() < 40
     assert np.allclose(model.replay_buffer.rewards[:40, 0], -np.abs(after) - 2.0 * mistakes, atol=1e-6)
+
+
+@pytest.mark.parametrize(("penalty", "factor"), [("auto", 1.0), ("auto_0.5", 0.5)])
+def test_automatic_penalty_is_the_root_mean_square_of_the_rewards_so_far(penalty, factor):
+    model = build(SACAP, penalty=penalty)
+    model.learn(40)
+    before, after = positions(model.replay_buffer, 40)
+    scale = np.sqrt(np.cumsum(after**2.0) / np.arange(1, 41))
+    expected = -np.abs(after) - factor * scale * (np.abs(after) > np.abs(before))
+    assert np.allclose(model.replay_buffer.rewards[:40, 0], expected, atol=1e-5)
+
+
+def test_automatic_penalty_is_one_while_all_rewards_are_zero():
+    scale = RewardScale()
+    scale.update([0.0, 0.0])
+    assert RewardShaping("auto").penalty_at(float(scale)) == 1.0
+    scale.update([0.2, 0.0])
+    assert RewardShaping("auto_2.0").penalty_at(float(scale)) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("labels", [{}, {"ap_function": towards_centre}])
@@ -159,9 +177,10 @@ def test_saved_model_keeps_penalty_and_potential(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"penalty": -1.0}, "^`penalty` must be a number of at least 0, but is -1.0"),
-        ({"penalty": "big"}, "^`penalty` must be a number of at least 0, but is 'big'"),
-        ({"penalty": np.inf}, "^`penalty` must be a number of at least 0, but is inf"),
+        *(
+            ({"penalty": c}, f'^`penalty` must be a number of at least 0, "auto" or "auto_<number>", but is {c!r}')
+            for c in (-1.0, "big", np.inf, "auto_", "auto_-1")
+        ),
         ({"potential": lambda obs: obs}, r"^`potential` .* must return \d+ finite numbers, .* shape \(\d+, 2\)"),
         ({"potential": lambda obs: np.full(len(obs), np.nan)}, "^`potential` .* values that are not finite"),
         ({"potential": lambda obs: obs["x"]}, "^`potential` .* raised IndexError"),

@@ -1,0 +1,131 @@
+"""The page that compares the recommended settings with what a good engineer would try in one line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_sap.benchmark.reports.drawing import line_figure
+from sb3_sap.benchmark.reports.measures import LOST, median_reached, ms_per_step, steps_to_competence
+from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_figure, write_page
+from sb3_sap.benchmark.reports.results import Results
+from sb3_sap.benchmark.reports.returns import steps_to_return
+from sb3_sap.benchmark.task_settings import target_return
+from sb3_sap.common.arrays import FloatArray
+from sb3_sap.evaluation.laps import ENVIRONMENTS
+from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+
+#: Shares of the training after which the score is told.
+SHARES = (0.25, 0.5, 1.0)
+#: S on every track from which a lap-driving policy has learned the task.
+GOOD = 0.95
+NOTE = (
+    "All configurations of an algorithm share its base settings and explore alike; those that name a `penalty` alone "
+    "use the label as a reward penalty of so much, or by default of the root mean square of the rewards, and "
+    "`penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as the "
+    "interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over seeds, in "
+    "which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. *Mistakes* "
+    "is the share of all training steps that the AP function labels non-permissible. Milliseconds per step are "
+    "processor time.\n"
+)
+
+
+def rivals(results: Results, folder: Path, command: str) -> None:
+    """Writes ``rivals.md``, ``rivals.svg``, ``rivals.csv`` with a row for every run and checkpoint, and
+    ``rivals_improvement.csv``.
+    """
+    laps = results.simulator in ENVIRONMENTS
+    scores = run_scores(results)
+    write_csv(folder / "rivals.csv", scores.round(6))
+    write_figure(
+        folder / "rivals.svg",
+        line_figure(scores, results.names, "checkpoint", "score", "training step", "S" if laps else "mean return"),
+    )
+    rows = [_row(results, scores, name) for name in results.names]
+    improvements = improvement(results, scores)
+    write_csv(folder / "rivals_improvement.csv", improvements.round(6))
+    note = NOTE.format(
+        tests="tracks" if laps else "episodes",
+        goal=f"goal (every lap done with S of at least {GOOD})"
+        if laps
+        else f"goal (a mean return of {_goal(results):g})",
+    )
+    parts = ["![Scores over training steps](rivals.svg)\n", markdown(pd.DataFrame(rows)), note]
+    parts += ["## Probability that a run with the recommended settings ends better than a rival's\n"]
+    intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
+    parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
+    title = f"The recommended settings and their rivals ({results.simulator}, {results.steps:,} steps)"
+    write_page(folder / "rivals.md", title, parts, results, command)
+
+
+def run_scores(results: Results) -> pd.DataFrame:
+    """Mean score over tracks or episodes: columns ``configuration``, ``seed``, ``checkpoint``, ``score``."""
+    keys = ["configuration", "seed", "checkpoint"]
+    return results.laps.groupby(keys, sort=False)["score"].mean().reset_index()
+
+
+def improvement(results: Results, scores: pd.DataFrame) -> pd.DataFrame:
+    """Compares the recommended configuration of each algorithm with its other ones, at the end.
+
+    :return: columns ``recommended``, ``against``, ``probability``, ``low`` and ``high``
+    """
+    rows = []
+    for ours in results.configurations:
+        if "recommended" not in ours.preset:
+            continue
+        for other in results.configurations:
+            if other.algo == ours.algo and other != ours:
+                estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, other.name, 1.0))
+                rows.append([ours.name, other.name, *estimate])
+    return pd.DataFrame(rows, columns=["recommended", "against", "probability", "low", "high"])
+
+
+def _goal(results: Results) -> float:
+    return target_return(results.simulator)
+
+
+def _at(scores: pd.DataFrame, name: str, share: float) -> FloatArray:
+    """Scores of a configuration's runs at the last checkpoint up to a share of the training: (runs, 1)."""
+    own = scores[scores["configuration"] == name]
+    last = own["checkpoint"].max()
+    checkpoint = own["checkpoint"][own["checkpoint"] <= share * last].max()
+    values: FloatArray = own[own["checkpoint"] == checkpoint]["score"].to_numpy()[:, None]
+    return values
+
+
+def _row(results: Results, scores: pd.DataFrame, name: str) -> dict[str, str]:
+    own = scores[scores["configuration"] == name]
+    last = own["checkpoint"].max()
+    row = {"configuration": name, "seeds": str(own["seed"].nunique())}
+    digits = 3 if results.simulator in ENVIRONMENTS else 1
+    for share in SHARES:
+        values = _at(scores, name, share)
+        low, high = bootstrap_interval(values)
+        row[f"after {share * last:,.0f}"] = (
+            f"{interquartile_mean(values):.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+        )
+    row["worst seed"] = f"{_at(scores, name, 1.0).min():.{digits}f}"
+    if results.simulator in ENVIRONMENTS:
+        laps = results.final_laps().query("configuration == @name", local_dict={"name": name})
+        all_done = laps.groupby("seed")["lap_done"].all()
+        row["runs that fail"] = f"{(~all_done.astype(bool)).sum()} of {len(all_done)}"
+        reached = steps_to_competence(results.laps[results.laps["configuration"] == name], GOOD)
+    else:
+        reached = steps_to_return(own.rename(columns={"score": "return"}), _goal(results))
+    median, number = median_reached(reached)
+    row["steps until the goal"] = f"{median:,.0f} ({number})" if math.isfinite(median) else f"– ({number})"
+    curve = results.curve[results.curve["configuration"] == name]
+    if "mistakes" in curve and curve["mistakes"].notna().any():
+        ends = curve.sort_values("step").groupby("seed").last()
+        row["mistakes"] = f"{(ends['mistakes'].astype(float) / ends['step']).median():.1%}"
+    if results.simulator in ENVIRONMENTS:
+        episodes = results.episodes.query(
+            "configuration == @name and ended in @lost", local_dict={"name": name, "lost": LOST}
+        )
+        lost = episodes.groupby("seed").size().reindex(own["seed"].unique(), fill_value=0)
+        row["episodes lost"] = f"{lost.median():g}"
+    milliseconds = ms_per_step(results.times[results.times["configuration"] == name]).median()
+    return row | {"ms per step": "" if np.isnan(milliseconds) else f"{milliseconds:.1f}"}

@@ -1,0 +1,61 @@
+"""How many steps fit into the time that a user gives a comparison."""
+
+from __future__ import annotations
+
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+from sb3_sap.comparison.worker import Job, run_in_process
+
+#: Trained steps of a trial, beyond those that the algorithm takes before it learns.
+TRIED = 200
+#: Seconds to import the libraries and build a model.
+START = 4.0
+
+
+def steps_within(minutes: float, trials: list[Job], seeds: int, jobs: int) -> int:
+    """The number of steps with which all runs together take about that long.
+
+    :param trials: one run of each way
+    :param seeds: runs of each way
+    :param jobs: runs side by side
+    :raise ValueError: if the time does not suffice for a trial's steps
+    """
+    warm_up = max(int(job.settings.get("learning_starts", 100)) for job in trials)
+    with ThreadPoolExecutor(jobs) as pool:
+        measured = list(pool.map(lambda job: _measure(job, warm_up), trials))
+    costs = [step for step, _ in measured]
+    fixed = [
+        START + episode * job.episodes * job.evaluations for job, (_, episode) in zip(trials, measured, strict=True)
+    ]
+    available = 60.0 * minutes * jobs / seeds - sum(fixed)
+    steps = int(available / sum(costs))
+    if steps < warm_up + TRIED:
+        needed = (sum(fixed) + sum(costs) * (warm_up + TRIED)) * seeds / jobs / 60
+        raise ValueError(
+            f"{minutes:g} minutes suffice for {max(0, steps)} steps of each run, which is too few to compare: give at "
+            f"least {math.ceil(needed)} minutes, or fewer `seeds`, or the number of `steps`."
+        )
+    return steps
+
+
+def _measure(job: Job, warm_up: int) -> tuple[float, float]:
+    """Seconds of a training step and of an evaluation episode."""
+    # Two evaluations: the time between them is that of the steps between them and of the second one.
+    total = warm_up + TRIED
+    began = time.monotonic()
+    moments: list[tuple[float, float]] = []
+    for answer in run_in_process(replace(job, steps=total, evaluations=2, episodes=1)):
+        _check(answer)
+        if "took" in answer:
+            moments.append((time.monotonic() - began, float(answer["took"])))
+    (first, _), (second, evaluation) = moments
+    return max(1e-5, (second - first - evaluation) / (total - total // 2)), evaluation
+
+
+def _check(answer: dict[str, Any]) -> None:
+    if "error" in answer:
+        raise ValueError(f"The trial run failed: {answer['error']}")

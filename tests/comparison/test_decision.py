@@ -1,0 +1,119 @@
+"""From runs to a decision, and to code that trains with it."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from toy import Line, towards_centre
+
+from sb3_sap import compare
+from sb3_sap.comparison.code import lines
+from sb3_sap.comparison.decision import Comparison
+from sb3_sap.comparison.pilot import steps_within
+from sb3_sap.comparison.ways import ways
+from sb3_sap.comparison.worker import Job
+
+
+def compared(returns, algo="sac_ap"):
+    """A comparison whose runs have the given returns: by way, a list of (first, last) for each seed."""
+    rows = [
+        {"way": way, "seed": seed, "step": step, "return": value, "mistakes": 0.25}
+        for way, runs in returns.items()
+        for seed, run in enumerate(runs)
+        for step, value in zip((50, 100), run, strict=True)
+    ]
+    kept = [way for way in ways(algo, potential=False) if way.name in returns]
+    return Comparison(kept, pd.DataFrame(rows), {way.name: f"# {way.name}" for way in kept})
+
+
+def runs(first, last, noise=0.0):
+    return [(first + noise * i, last + noise * i) for i in range(5)]
+
+
+def test_way_that_is_clearly_better_is_chosen():
+    result = compared({"base": runs(0, 1), "penalty": runs(5, 6), "guidance": runs(2, 3)})
+    assert result.choice.name == "penalty"
+    assert result.decision == (
+        "Use penalty: the label as a reward penalty. A run of it beats one of base with probability 1.00 (95 % "
+        "interval 1.00 to 1.00). This holds for 100 steps."
+    )
+    assert result.code == "# penalty"
+
+
+def test_simplest_way_is_chosen_where_no_other_is_shown_to_be_better():
+    result = compared({"base": runs(0, 1, noise=1.0), "penalty": runs(0.5, 1.5, noise=1.0)})
+    assert result.best.name == "penalty"
+    assert result.choice.name == "base"
+    assert "Penalty did best, but is not shown to be better than base, which is simpler" in result.decision
+
+
+def test_learning_sooner_counts_as_well_as_ending_better():
+    result = compared({"base": runs(0, 6), "penalty": runs(6, 6)})
+    assert result.choice.name == "penalty"
+    assert result.scores("base").tolist() == [[3.0]] * 5
+    assert result.final("base").tolist() == [[6.0]] * 5
+
+
+def test_table_has_a_row_for_each_way_and_files_are_written(tmp_path):
+    result = compared({"base": runs(0, 1), "penalty": runs(5, 6)})
+    assert result.table["way"].tolist() == ["base", "penalty"]
+    assert result.table["worst run"].tolist() == ["1", "6"]
+    assert result.table["mistakes"].tolist() == ["25.0%", "25.0%"]
+    result.save(tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"evaluations.csv", "table.csv", "curves.png", "decision.txt", "train.py"}
+
+
+def test_ways_of_finite_actions_hold_no_loss_and_shaping_needs_a_potential():
+    assert [way.name for way in ways("dqn_ap", potential=True)] == ["base", "penalty", "shaping", "guidance"]
+    assert [way.name for way in ways("td3_ap", potential=False)] == ["base", "penalty", "recommended", "guidance"]
+
+
+@pytest.mark.parametrize("algo", ["ddpg_ap", "dqn_ap"])
+def test_code_of_every_way_can_be_run(algo, monkeypatch, tmp_path):
+    discrete = algo == "dqn_ap"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gymnasium.make", lambda name: Line(n_actions=3 if discrete else None))
+    job = Job("Line-v0", {}, algo, {"learning_starts": 5, "batch_size": 4}, 0, 12, 10, 1)
+    for way in ways(algo, potential=True):
+        code = lines(way, job, "MlpPolicy", "toy.towards_centre", "toy.centred").replace(", progress_bar=True", "")
+        assert code.count("\n") < 20
+        scope = {}
+        exec(code, scope)
+        assert scope["model"].num_timesteps >= 12
+
+
+def test_code_names_functions_of_a_notebook_without_importing_them():
+    def mine(obs, actions, next_obs):
+        return towards_centre(obs, actions, next_obs)
+
+    mine.__module__, mine.__qualname__ = "__main__", "mine"
+    job = Job("Line-v0", {"dim": 1}, "sac_ap", {}, 0, 12, 10, 1)
+    code = lines(ways("sac_ap", False)[1], job, "MlpPolicy", mine, None)
+    assert "ap_function=mine" in code
+    assert "import mine" not in code
+    assert "gym.make('Line-v0', dim=1)" in code
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"seeds": 1}, "^`seeds` must be a whole number of at least 2, but is 1"),
+        ({"minutes": 0}, "^`minutes` must be a number above 0, but is 0"),
+        ({"steps": 0}, "^`steps` must be a whole number of at least 1, but is 0"),
+        ({"algo": "sac"}, "^`algo` = 'sac' is not a guided algorithm: did you mean 'sac_ap'"),
+        ({"ap_function": "toy.missing"}, "^`ap_function`: 'toy.missing' cannot be imported"),
+    ],
+)
+def test_bad_arguments_get_a_sentence(settings, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        compare(Line, **settings)
+
+
+def test_steps_follow_from_the_time(monkeypatch):
+    monkeypatch.setattr("sb3_sap.comparison.pilot._measure", lambda job, warm_up: (0.01, 0.1))
+    jobs = [Job("x", {}, "sac_ap", {}, 0, 0, 10, 5)] * 3
+    # 600 s of two processors for 3 ways of 4 seeds: 300 s, less 3 · (4 + 5) s, at 3 · 0.01 s a step.
+    assert steps_within(10, jobs, seeds=4, jobs=2) == int((300 - 27) / 0.03)
+    with pytest.raises(ValueError, match=r"^1 minutes suffice for 100 steps of each run, .* give at least 2 minutes"):
+        steps_within(1, jobs, seeds=4, jobs=2)
+    assert np.isfinite(steps_within(60, jobs, seeds=4, jobs=2))

@@ -15,6 +15,7 @@ from sb3_sap.benchmark.reports.drawing import curve_figure
 from sb3_sap.benchmark.reports.figures import with_averages
 from sb3_sap.benchmark.reports.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
 from sb3_sap.benchmark.reports.results import collect
+from sb3_sap.benchmark.reports.rivals import rivals
 from sb3_sap.benchmark.reports.summary import improvement
 from sb3_sap.benchmark.reports.tables import curve_table
 from sb3_sap.benchmark.runs import make_grid
@@ -40,7 +41,7 @@ def synthetic(run, accuracy=0.8):
     steps = range(25, run.steps + 1, 25)
     low = 300 if guided else run.steps  # the step until which the moving average is low
     e = (accuracy, accuracy - 0.05) if guided else (None, None)
-    curve = [[step, 10.0 if step <= low else 45.0, *e] for step in steps]
+    curve = [[step, 10.0 if step <= low else 45.0, *e, step // 2 if guided else None] for step in steps]
     lost = 10 if guided else 130
     episodes = [[10 * (i + 1), 10, -200.0, "off track"] for i in range(lost)]
     episodes.append([run.steps, run.steps - 10 * lost, 40.0 * (run.steps - 10 * lost), "unfinished"])
@@ -275,3 +276,19 @@ def test_the_page_of_claims_says_what_was_not_run(tmp_path):
     page = (tmp_path / "claims.md").read_text()
     assert page.count("| not run |") == sum(claim.steps == 15_000 for claim in CLAIMS)
     assert "Made by `sb3-sap benchmark claims`, from 5 runs" in page
+
+
+def test_rivals_of_the_recommended_settings(tmp_path):
+    names = ["ddpg_ap:base+penalty[penalty=0]", "ddpg_ap:base+recommended", "td3_ap:base+recommended"]
+    results = make(tmp_path, names, steps=1_000)
+    rivals(results, tmp_path, "command")
+    page = (tmp_path / "rivals.md").read_text(encoding="utf-8")
+    assert "| ddpg_ap:base+recommended | ddpg_ap:base+penalty[penalty=0] | " in page
+    assert "| ddpg_ap:base+recommended | td3_ap" not in page  # another algorithm is no rival
+    assert "50.0%" in page  # of the steps were mistakes
+    assert {path.name for path in tmp_path.glob("rivals*")} == {
+        "rivals.md",
+        "rivals.svg",
+        "rivals.csv",
+        "rivals_improvement.csv",
+    }

@@ -222,7 +222,7 @@ def synthetic(of, name):
     tables = {
         "laps": (RETURN_COLUMNS, data),
         "times": (TIME_COLUMNS, [[at, 9.0 + at, at, 1 + at / 20] for at in of.checkpoints] if of.steps else []),
-        "curve": (CURVE_COLUMNS, [[25, 1.0, 0.8, 0.7]] if of.steps else []),
+        "curve": (CURVE_COLUMNS, [[25, 1.0, 0.8, 0.7, 10]] if of.steps else []),
         "episodes": (EPISODE_COLUMNS, [[of.steps, of.steps, 1.0, "unfinished"]] if of.steps else []),
     }
     return {"run": of.description(), "made": MADE} | {

@@ -53,11 +53,12 @@ def report(options: argparse.Namespace, console: Console) -> int:
 
 def task(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of a task beyond lane keeping and writes its page."""
-    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, task_configurations
+    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, rivals_of, task_configurations
 
     options.tracks = list(EPISODES)
     options.steps = options.steps or planned_steps(options.simulator)
-    options.configurations = options.configurations or task_configurations(options.simulator)
+    compared = rivals_of if options.report == "rivals" else task_configurations
+    options.configurations = options.configurations or compared(options.simulator)
     failed = _run_missing(options, options.steps, console)
     _write(options, options.report, console)
     return int(failed > 0)

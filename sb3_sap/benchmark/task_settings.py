@@ -28,6 +28,10 @@ LONGER = 10
 FEWER = 3
 #: Mean returns that count as a task's goal where the environment names none, or one that takes long to reach.
 GOALS = {"Pendulum-v1": -200.0, "Acrobot-v1": -100.0, "MountainCarContinuous-v0": 90.0, "MountainCar-v0": -110.0}
+#: The constant reward penalty that did best in a screening on design seeds, as a rival.
+TUNED_PENALTIES = {"MountainCarContinuous-v0": 0.25, "Pendulum-v1": 0.5, "MountainCar-v0": 1.0, "Acrobot-v1": 1.0}
+#: Presets that are not for lane keeping alone.
+ANY_TASK = ("penalty", "recommended")
 #: Settings of guided algorithms that say how labels are used, and not what they are.
 GUIDANCE = (
     set(inspect.signature(ActionPermissibilityMixin).parameters) - set(inspect.signature(OffPolicyAlgorithm).parameters)
@@ -71,6 +75,19 @@ def task_configurations(env_id: str) -> list[str]:
     return configurations + (["oracle"] if "ap_function" in entry("oracle", env_id) else [])
 
 
+def rivals_of(env_id: str) -> list[str]:
+    """The recommended settings of the first guided algorithm with an entry, its rivals, and the entry itself."""
+    algo = guided_algorithms(env_id)[0]
+    tuned = TUNED_PENALTIES.get(env_id)
+    return [
+        f"{algo}:base+penalty[penalty=0]",
+        *([] if tuned is None else [f"{algo}:base+penalty[penalty={tuned:g}]"]),
+        f"{algo}:base+penalty",
+        f"{algo}:base+recommended",
+        f"{algo}:task",
+    ]
+
+
 def planned_steps(env_id: str) -> int:
     """Training steps of the first guided algorithm with an entry."""
     return int(entry(guided_algorithms(env_id)[0], env_id)["n_timesteps"])
@@ -81,7 +98,7 @@ def task_settings(algo: str, preset: str, env_id: str, known: set[str]) -> dict[
 
     :param preset: "default", the library's defaults; "task", the entry of the guided algorithm, without what an
         unguided base does not know; "base", the same for a guided algorithm, with the label but without guidance;
-        "tuned", RL Zoo's settings of the base; or a preset of the algorithm
+        "tuned", RL Zoo's settings of the base; or one of `ANY_TASK`
     :param known: parameters of the constructor
     :raise ValueError: if the algorithm has no such preset for the environment
     """
@@ -92,7 +109,7 @@ def task_settings(algo: str, preset: str, env_id: str, known: set[str]) -> dict[
         return settings if is_guided(algo) else {key: value for key, value in settings.items() if key in known}
     if preset == "base" and is_guided(algo):
         return {key: value for key, value in settings_in(entry(algo, env_id)).items() if key not in GUIDANCE}
-    if preset in preset_names(algo):
+    if preset in ANY_TASK and preset in preset_names(algo):
         return settings_of_preset(preset, algo)
     tuned = load_config(algo).get(env_id) if not is_guided(algo) and algo in algorithms() else None
     if preset != "tuned" or tuned is None:

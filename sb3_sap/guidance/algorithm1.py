@@ -61,10 +61,10 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
         """The actions a_t of all environments, in their units and scaled, each (n_envs, *action_shape)."""
-        if self.lifetime_steps < self.noise_steps or self.alpha == 0:
+        if self.lifetime_steps < self.noise_steps:
             # The base algorithm explores: a_t = μ(s_t) + N_t                                  # lines 1-4
             return super()._sample_action(learning_starts, action_noise, n_envs)
-        if self.guidance_ended:  # beyond the paper
+        if self.guidance_ended or self.alpha == 0:  # beyond the paper
             return super()._sample_action(0, action_noise, n_envs)
         # From t_k on without noise, and in a second `learn()` without another uniform warm-up: a_t = μ(s_t)
         actions, scaled = super()._sample_action(0, None, n_envs)  # line 1

@@ -6,7 +6,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.utils import set_random_seed
 from torch.nn import functional as F
-from toy import DISCRETE, GUIDED, Line, build
+from toy import DISCRETE, GUIDED, build
 
 from sb3_sap import DDPGAP, DQNAP, SACAP, TD3AP, CrossQAP
 
@@ -79,23 +79,19 @@ def test_modes_and_running_statistics_of_the_networks_are_restored():
     assert all(th.equal(value, buffers[key]) for key, value in model.policy.named_buffers())
 
 
-def test_scale_of_the_loss_follows_the_rewards():
-    class Scaled(Line):
-        factor = 1.0
+def test_scale_of_the_loss_is_the_spread_of_q_over_actions(monkeypatch):
+    model = build(SACAP).learn(40)
+    observations = model.replay_buffer.sample(model.predictor.batch_size).observations
+    for factor in (6.0, 6000.0):
 
-        def step(self, action):
-            obs, reward, *rest = super().step(action)
-            return obs, self.factor * reward, *rest
+        def linear(model, obs, actions, factor=factor):
+            return 500 + factor * actions[:, 0]
 
-    small, large = Scaled(), Scaled()
-    large.factor = 1000.0
-    spreads = []
-    for env in (small, large):
-        model = build(SACAP, env, **SETTINGS, learning_rate=0.01, gamma=0.0, learning_starts=400)
-        model.learn(400)
-        model.train(300, 64)
-        spreads.append(model.q_spread)
-    assert spreads[1] > 20 * spreads[0]
+        # A constant in Q, as a constant in the reward brings it, changes nothing.
+        monkeypatch.setattr("sb3_sap.guidance.permissibility_loss.q_values", linear)
+        model.q_spread = 0.0
+        model._measure_spread(observations)
+        assert model.q_spread == pytest.approx(factor / 3**0.5, rel=0.2)  # of a uniform variable from -1 to 1
 
 
 def test_linear_coefficient_ends_at_zero():
@@ -104,6 +100,12 @@ def test_linear_coefficient_ends_at_zero():
     model.learn(60, callback=lambda *_: coefs.append(model._current_coef) or True)
     assert coefs[0] > 0.9
     assert coefs[-1] == pytest.approx(0.0, abs=0.02)
+
+
+def test_coefficient_may_fade_earlier():
+    model = build(TD3AP, alpha=0.0, permissibility_coef="lin_2.0_0.5")
+    coefs = [model.permissibility_coef(remaining) for remaining in (1.0, 0.75, 0.5, 0.0)]
+    assert coefs == pytest.approx([2.0, 1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("value", [-0.1, float("nan")])

@@ -92,7 +92,7 @@ def _at(scores: pd.DataFrame, name: str, share: float) -> FloatArray:
     own = scores[scores["configuration"] == name]
     last = own["checkpoint"].max()
     checkpoint = own["checkpoint"][own["checkpoint"] <= share * last].max()
-    values: FloatArray = own[own["checkpoint"] == checkpoint]["score"].to_numpy()[:, None]
+    values: FloatArray = own[own["checkpoint"] == checkpoint]["score"].to_numpy()[:, None]  # empty if there is none
     return values
 
 
@@ -103,6 +103,8 @@ def _row(results: Results, scores: pd.DataFrame, name: str) -> dict[str, str]:
     digits = 3 if results.simulator in ENVIRONMENTS else 1
     for share in SHARES:
         values = _at(scores, name, share)
+        if len(values) == 0:  # no evaluation so early
+            continue
         low, high = bootstrap_interval(values)
         row[f"after {share * last:,.0f}"] = (
             f"{interquartile_mean(values):.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

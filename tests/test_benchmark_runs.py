@@ -176,10 +176,11 @@ def test_evaluation_does_not_change_training(algo):
         model.learn(80, callback=callback)
         return model
 
-    def evaluate(policy):
+    def evaluate(policy, checkpoint):
         from sb3_sap.evaluation.laps import drive_lap
 
-        evaluated.append(policy.num_timesteps)
+        assert checkpoint == policy.num_timesteps
+        evaluated.append(checkpoint)
         drive_lap(policy, "g-track-3")
         return []
 
@@ -239,3 +240,14 @@ def test_a_learning_rate_that_falls_is_written_alike_for_the_base(algo):
 )
 def test_how_an_episode_ended(info, how):
     assert how_ended(info) == how
+
+
+def test_long_laps_are_driven_at_the_end_only():
+    names = ("ole-road-1", "g-track-3")
+    plain = make_run(parse_configuration("ddpg"), "highway", 150, 0, names)
+    later = make_run(parse_configuration("ddpg"), "highway", 150, 0, names, at_the_end=["ole-road-1", "spring"])
+    assert later.at_the_end == ["ole-road-1"]  # of the tracks that are driven at all
+    assert "at_the_end" not in plain.description()  # so that older results keep their names
+    assert plain.name != later.name
+    laps = train_and_evaluate(later, 0.0)["laps"]["data"]
+    assert [row[:2] for row in laps] == [[100, "g-track-3"], [150, "ole-road-1"], [150, "g-track-3"]]

@@ -160,7 +160,8 @@ def _grid(options: argparse.Namespace, steps: int, console: Console | None = Non
     left_out: dict[str, ValueError] = {}
     for configuration in parse_configurations(options.configurations):
         try:
-            grid |= make_grid([configuration], options.simulator, steps, seeds, options.tracks)
+            later = getattr(options, "at_the_end", [])
+            grid |= make_grid([configuration], options.simulator, steps, seeds, options.tracks, later)
         except ValueError as error:
             if console is None:
                 raise

@@ -17,18 +17,21 @@ from sb3_sap.permissibility import APFunction, query_labels
 RETURN_COLUMNS = ["checkpoint", "track", "success", "permissible", "total_reward", "score", "steps"]
 
 
-def evaluation(env_id: str, algo: str, options: dict[str, Any], seeds: list[str]) -> Callable[[Any], list[list[Any]]]:
+def evaluation(
+    env_id: str, algo: str, options: dict[str, Any], seeds: list[str]
+) -> Callable[[Any, int], list[list[Any]]]:
     """A function that evaluates a policy deterministically.
 
     :param options: of the environment
     :param seeds: one for each episode
-    :return: a function of a policy, which returns rows of ``RETURN_COLUMNS`` without the checkpoint
+    :return: a function of a policy and a checkpoint, which returns rows of ``RETURN_COLUMNS`` without the checkpoint
     """
     name = entry(algo, env_id).get("ap_function")
     ap_function = None if name is None else resolve(name, "ap_function")
     envs = [make_env(env_id, **options) for _ in seeds]
 
-    def evaluate(policy: Any) -> list[list[Any]]:
+    def evaluate(policy: Any, checkpoint: int = 0) -> list[list[Any]]:
+        del checkpoint  # all are alike
         episodes = [Episode(env, int(seed)) for env, seed in zip(envs, seeds, strict=True)]
         # The episodes run side by side, because a small network takes as long for one observation as for all.
         while running := [episode for episode in episodes if not episode.done]:

@@ -64,11 +64,11 @@ class Recorder(BaseCallback):
     """Records a training run without changing it.
 
     :param checkpoints: steps after which ``evaluate`` is called with the model
-    :param evaluate: returns rows of the table of laps, without the checkpoint
+    :param evaluate: a function of the model and the checkpoint: rows of the table of laps, without the checkpoint
     :param clock: is stopped during evaluations
     """
 
-    def __init__(self, checkpoints: list[int], evaluate: Callable[[Any], list[list[Any]]], clock: Clock):
+    def __init__(self, checkpoints: list[int], evaluate: Callable[[Any, int], list[list[Any]]], clock: Clock):
         super().__init__()
         self.laps: list[list[Any]] = []
         self.times: list[list[Any]] = []
@@ -112,7 +112,7 @@ class Recorder(BaseCallback):
         times = [wall, wall - (self._began or 0.0), self._clock.process()]
         self.times.append([checkpoint, *(round(seconds, 3) for seconds in times)])
         with self._clock.stopped():
-            self.laps += [[checkpoint, *row] for row in self._evaluate(self.model)]
+            self.laps += [[checkpoint, *row] for row in self._evaluate(self.model, checkpoint)]
 
     def _on_step(self) -> bool:
         [info], [done] = self.locals["infos"], self.locals["dones"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from sb3_sap.benchmark.configurations import Configuration
@@ -33,6 +33,9 @@ class Run:
     seed: int
     tracks: list[str]  # beyond lane keeping: seeds of the evaluation episodes
     checkpoints: list[int]
+    at_the_end: list[str] = field(
+        default_factory=list
+    )  # those of the tracks that are driven at the last checkpoint only
 
     @property
     def task(self) -> dict[str, Any]:
@@ -47,6 +50,8 @@ class Run:
     def description(self) -> dict[str, Any]:
         """The run as JSON holds it."""
         described: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        if not self.at_the_end:
+            del described["at_the_end"]  # as in results that are older than this field
         return described
 
 
@@ -63,16 +68,22 @@ def name_of(description: Mapping[str, Any]) -> str:
 
 
 def make_run(
-    configuration: Configuration, simulator: str, steps: int, seed: int, tracks: Iterable[str] = TEST_TRACKS
+    configuration: Configuration,
+    simulator: str,
+    steps: int,
+    seed: int,
+    tracks: Iterable[str] = TEST_TRACKS,
+    at_the_end: Iterable[str] = (),
 ) -> Run:
     """The run of a configuration and a seed, with the settings of its preset.
 
     :param simulator: a key of `ENVIRONMENTS`, or the id of an environment beyond lane keeping
     :param steps: training steps, unless the configuration has its own
     :param tracks: tracks of the test laps, or seeds of the evaluation episodes
+    :param at_the_end: those of the tracks whose laps are so long that they are driven at the last checkpoint only
     :raise ValueError: if the configuration has no such algorithm, preset or setting
     """
-    steps = configuration.run_option("steps", steps)
+    tracks, steps = list(tracks), configuration.run_option("steps", steps)
     settings = settings_of(configuration, simulator, steps)
     if simulator in ENVIRONMENTS:
         training = {"track": "wheel-2", "laps": None} | environment_of(configuration)
@@ -84,7 +95,18 @@ def make_run(
         steps = steps if configuration.learns else 0
         checkpoints = evaluations(steps) if configuration.learns else [0]
     defaults = defaults_of(configuration, settings)
-    return Run(simulator, configuration.algo, settings, defaults, training, steps, seed, list(tracks), checkpoints)
+    return Run(
+        simulator,
+        configuration.algo,
+        settings,
+        defaults,
+        training,
+        steps,
+        seed,
+        tracks,
+        checkpoints,
+        [track for track in at_the_end if track in tracks],
+    )
 
 
 def make_grid(
@@ -93,12 +115,13 @@ def make_grid(
     steps: int,
     seeds: Iterable[int],
     tracks: Iterable[str] = TEST_TRACKS,
+    at_the_end: Iterable[str] = (),
 ) -> dict[Configuration, list[Run]]:
     """The runs of every configuration, one for each seed; the linear controller is deterministic and has one run."""
     seeds, tracks = list(seeds), list(tracks)
     return {
         configuration: [
-            make_run(configuration, simulator, steps, seed, tracks)
+            make_run(configuration, simulator, steps, seed, tracks, at_the_end)
             for seed in (
                 seeds[: configuration.run_option("seeds", len(seeds))] if configuration.algo != "linear" else [0]
             )

@@ -63,14 +63,18 @@ def _learn(model: Any, steps: int, recorder: Recorder, clock: Clock, path: Path 
     path.unlink(missing_ok=True)
 
 
-def _laps(run: Run) -> Callable[[Any], list[list[Any]]]:
-    """A function that drives a lap of every test track and returns rows of ``LAP_COLUMNS`` without the checkpoint."""
+def _laps(run: Run) -> Callable[..., list[list[Any]]]:
+    """A function of a policy and a checkpoint, by default the last, that drives a lap of every test track.
+
+    It returns rows of ``LAP_COLUMNS`` without the checkpoint.
+    """
     tests: dict[str, gym.Env[Any, Any]] = {}
 
-    def evaluate(policy: Any) -> list[list[Any]]:
+    def evaluate(policy: Any, checkpoint: int = run.checkpoints[-1]) -> list[list[Any]]:
+        later = run.at_the_end if checkpoint < run.checkpoints[-1] else []
         if not tests:
             tests.update({track: lap_env(track, run.simulator, **run.task) for track in run.tracks})
-        driven = [lap(policy, env, track) for track, env in tests.items()]
+        driven = [lap(policy, env, track) for track, env in tests.items() if track not in later]
         return [
             [r.track, r.lap_done, round(r.covered, 6), round(r.total_reward, 2), round(r.score, 6), r.steps]
             for r in driven

@@ -32,9 +32,12 @@ REPORTS = {
     "auxiliary": (["auxiliary"], "summary of how often the auxiliary actor loss is applied"),
     "robustness": (["robustness"], "summary at 80 km/h and from random starts, for which nothing was tuned"),
     "rivals": (["rivals"], "the recommended settings, a reward penalty with the same label, and the base"),
+    "wrong_labels": (["wrong_labels"], "the same for labels that are wrong"),
 }
 #: Reports that are summaries of other configurations.
 SUMMARIES = ("summary", "ablations", "details", "auxiliary", "robustness")
+#: Reports that compare the recommended settings with rivals.
+RIVALS = ("rivals", "wrong_labels")
 #: Training steps of the paper's two experiments.
 PAPER_STEPS = (3_000, 15_000)
 
@@ -124,7 +127,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, leave_out_u
         "headline": tables.headline,
         **{kind: partial(summary.summary, name=kind) for kind in SUMMARIES},
         "returns": returns.returns,
-        "rivals": rivals.rivals,
+        **{kind: partial(rivals.rivals, kind=kind) for kind in RIVALS},
     }
     writers[name](results, folder, command_line(options, name))
     console.print(f"wrote {folder / name}.md", soft_wrap=True)

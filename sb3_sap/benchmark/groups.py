@@ -85,5 +85,14 @@ GROUPS: dict[str, list[str]] = {
             "fast",
         )
     ],
+    # The same with labels that are wrong: one in ten, or all in a region.
+    "wrong_labels": [
+        "ddpg_ap:base+penalty[penalty=0]",
+        *(
+            f"ddpg_ap:base+{presets}[ap_function=sb3_sap.benchmark.wrong_labels.{labels}]"
+            for labels in ("one_in_ten", "in_a_region")
+            for presets in ("penalty", "recommended")
+        ),
+    ],
 }
 GROUPS["all"] = [*PAPER, *GROUPS["guided"], *GROUPS["baselines"], *GROUPS["sbx"], "linear"]

@@ -11,6 +11,7 @@ import pandas as pd
 from sb3_sap.benchmark.reports.drawing import line_figure
 from sb3_sap.benchmark.reports.measures import LOST, median_reached, ms_per_step, steps_to_competence
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_figure, write_page
+from sb3_sap.benchmark.reports.reference import reference_share
 from sb3_sap.benchmark.reports.results import Results
 from sb3_sap.benchmark.reports.returns import steps_to_return
 from sb3_sap.benchmark.task_settings import target_return
@@ -28,37 +29,42 @@ NOTE = (
     "`penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as the "
     "interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over seeds, in "
     "which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. *Mistakes* "
-    "is the share of all training steps that the AP function labels non-permissible. Milliseconds per step are "
+    "is the share of all training steps that the AP function labels non-permissible, and *in excess* what it exceeds "
+    "the share of a good policy by, which is {reference:.1%} ({good}). Milliseconds per step are "
     "processor time.\n"
 )
 
 
-def rivals(results: Results, folder: Path, command: str) -> None:
-    """Writes ``rivals.md``, ``rivals.svg``, ``rivals.csv`` with a row for every run and checkpoint, and
-    ``rivals_improvement.csv``.
+def rivals(results: Results, folder: Path, command: str, kind: str = "rivals") -> None:
+    """Writes ``KIND.md``, ``KIND.svg``, ``KIND.csv`` with a row for every run and checkpoint, and
+    ``KIND_improvement.csv``.
     """
     laps = results.simulator in ENVIRONMENTS
     scores = run_scores(results)
-    write_csv(folder / "rivals.csv", scores.round(6))
+    write_csv(folder / f"{kind}.csv", scores.round(6))
     write_figure(
-        folder / "rivals.svg",
+        folder / f"{kind}.svg",
         line_figure(scores, results.names, "checkpoint", "score", "training step", "S" if laps else "mean return"),
     )
-    rows = [_row(results, scores, name) for name in results.names]
+    reference = reference_share(results, scores)
+    rows = [_row(results, scores, name, reference) for name in results.names]
     improvements = improvement(results, scores)
-    write_csv(folder / "rivals_improvement.csv", improvements.round(6))
+    write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
     note = NOTE.format(
+        reference=reference,
+        good="linear feedback" if laps else "the configuration that ends best",
         tests="tracks (without Spring, whose long lap is driven at the end only)" if laps else "episodes",
         goal=f"goal (every lap done with S of at least {GOOD})"
         if laps
         else f"goal (a mean return of {_goal(results):g})",
     )
-    parts = ["![Scores over training steps](rivals.svg)\n", markdown(pd.DataFrame(rows)), note]
+    parts = [f"![Scores over training steps]({kind}.svg)\n", markdown(pd.DataFrame(rows)), note]
     parts += ["## Probability that a run with the recommended settings ends better than a rival's\n"]
     intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
     parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
-    title = f"The recommended settings and their rivals ({results.simulator}, {results.steps:,} steps)"
-    write_page(folder / "rivals.md", title, parts, results, command)
+    title = "The recommended settings and their rivals" + (", with wrong labels" if kind == "wrong_labels" else "")
+    title = f"{title} ({results.simulator}, {results.steps:,} steps)"
+    write_page(folder / f"{kind}.md", title, parts, results, command)
 
 
 def run_scores(results: Results) -> pd.DataFrame:
@@ -101,7 +107,7 @@ def _at(scores: pd.DataFrame, name: str, share: float) -> FloatArray:
     return values
 
 
-def _row(results: Results, scores: pd.DataFrame, name: str) -> dict[str, str]:
+def _row(results: Results, scores: pd.DataFrame, name: str, reference: float) -> dict[str, str]:
     own = scores[scores["configuration"] == name]
     last = own["checkpoint"].max()
     row = {"configuration": name, "seeds": str(own["seed"].nunique())}
@@ -127,7 +133,8 @@ def _row(results: Results, scores: pd.DataFrame, name: str) -> dict[str, str]:
     curve = results.curve[results.curve["configuration"] == name]
     if "mistakes" in curve and curve["mistakes"].notna().any():
         ends = curve.sort_values("step").groupby("seed").last()
-        row["mistakes"] = f"{(ends['mistakes'].astype(float) / ends['step']).median():.1%}"
+        share = float((ends["mistakes"].astype(float) / ends["step"]).median())
+        row |= {"mistakes": f"{share:.1%}", "in excess": f"{share - reference:.1%}"}
     if results.simulator in ENVIRONMENTS:
         episodes = results.episodes.query(
             "configuration == @name and ended in @lost", local_dict={"name": name, "lost": LOST}

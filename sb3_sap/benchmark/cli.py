@@ -33,8 +33,6 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
         _add_grid(command)
         _add_workers(command)
         command.set_defaults(run=_with_extra(actions.report), report=name)
-        if name in actions.RIVALS:
-            command.set_defaults(at_the_end=["spring"])  # whose lap takes longer than all others together
     command = added.add_parser("claims", help="each result that section 5.2 of the paper states, with a verdict")
     _add_grid(command, steps=False)
     _add_workers(command)

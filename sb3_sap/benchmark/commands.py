@@ -38,6 +38,8 @@ REPORTS = {
 SUMMARIES = ("summary", "ablations", "details", "auxiliary", "robustness")
 #: Reports that compare the recommended settings with rivals.
 RIVALS = ("rivals", "wrong_labels")
+#: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
+LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.
 PAPER_STEPS = (3_000, 15_000)
 
@@ -80,13 +82,13 @@ def report_all(options: argparse.Namespace, console: Console) -> int:
 
     written = 0
     for name, (configurations, _) in REPORTS.items():
-        options.configurations = configurations
+        options.configurations, options.report = configurations, name
         try:
             _write(options, name, console, leave_out_unknown=True)
             written += 1
         except NoResults as error:
             console.print(f"{name} is left out: {error}", soft_wrap=True, markup=False)
-    options.configurations = ["paper"]
+    options.configurations, options.report = ["paper"], "claims"
     if written:
         _write_claims(options, console)
     return int(written == 0)
@@ -159,11 +161,11 @@ def _grid(options: argparse.Namespace, steps: int, console: Console | None = Non
     from sb3_sap.benchmark.runs import make_grid
 
     seeds = range(options.first_seed, options.first_seed + options.seeds)
+    later = LONG_LAPS if getattr(options, "report", None) in RIVALS else ()
     grid: dict[Configuration, list[Run]] = {}
     left_out: dict[str, ValueError] = {}
     for configuration in parse_configurations(options.configurations):
         try:
-            later = getattr(options, "at_the_end", [])
             grid |= make_grid([configuration], options.simulator, steps, seeds, options.tracks, later)
         except ValueError as error:
             if console is None:

@@ -39,6 +39,11 @@ PROGRAMS = {
     "dask": "import distributed, sb3_sap.benchmark.dispatch",
     "docs": "import furo, myst_parser, sphinx.application",
     "hub": "import huggingface_sb3, sb3_sap.cli.hub",
+    "robotics": """
+        from sb3_sap.evaluation import make_env
+
+        assert set(make_env("FetchReach-v4").reset(seed=0)[0]) == {"observation", "achieved_goal", "desired_goal"}
+    """,
     "tensorboard": """
         sb3_sap.DDPG("MlpPolicy", "Pendulum-v1", tensorboard_log="boards").learn(10)
         import tensorboard.program

@@ -29,6 +29,7 @@ CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} 
     "qrdqn": "sb3_contrib:QRDQN",
     "ddpg_ap_unbalanced": "sb3_sap.benchmark.ablated:DDPGAPUnbalanced",
     "ddpg_ap_proposed": "sb3_sap.benchmark.ablated:DDPGAPProposed",
+    "sac_recovery": "sb3_sap.benchmark.recovery:SACRecovery",
     "td3": "stable_baselines3:TD3",
     "sac": "stable_baselines3:SAC",
     "tqc": "sb3_contrib:TQC",
@@ -43,6 +44,7 @@ CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} 
 NAMESAKES = {algo: algo.removeprefix("sbx_") for algo in CLASSES if algo.startswith("sbx_")} | {
     "ddpg_ap_unbalanced": "ddpg_ap",
     "ddpg_ap_proposed": "ddpg_ap",
+    "sac_recovery": "sac_ap",
 }
 #: Prefix of overrides that change the environment instead of the algorithm.
 ENVIRONMENT = "env."

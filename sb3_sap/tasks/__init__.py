@@ -7,12 +7,15 @@ use what the environments return by default, unless their docstring names an opt
 from sb3_sap.tasks.driving import highway, parking
 from sb3_sap.tasks.energy import acrobot, mountain_car, mountain_car_continuous
 from sb3_sap.tasks.pendulum import pendulum_energy, pendulum_height, pendulum_torque
+from sb3_sap.tasks.reach import fetch_reach, nearness
 
 __all__ = [
     "acrobot",
+    "fetch_reach",
     "highway",
     "mountain_car",
     "mountain_car_continuous",
+    "nearness",
     "parking",
     "pendulum_energy",
     "pendulum_height",

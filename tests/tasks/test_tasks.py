@@ -242,3 +242,14 @@ def test_check_gives_advice_about_the_height_of_the_pendulum():
     report = check_permissibility(env, tasks.pendulum_height, policy=swings_up, verbose=False)
     assert any("does the label depend on the action" in sentence for sentence in report.advice)
     assert any("of your policy's own actions" in sentence for sentence in report.advice)
+
+
+# ------------------------------------------------------------------ robotics
+
+
+def test_hand_must_come_nearer_to_its_goal():
+    goal = rows([0.0, 0.0, 0.0]).repeat(4, axis=0)
+    before = {"desired_goal": goal, "achieved_goal": rows([0.2, 0, 0], [0.2, 0, 0], [0.2, 0, 0], [0, 0.01, 0])}
+    after = {"desired_goal": goal, "achieved_goal": rows([0.1, 0, 0], [0.2, 0, 0], [0, 0.3, 0], [0, 0.04, 0])}
+    assert tasks.fetch_reach(before, np.zeros((4, 4)), after).tolist() == [True, False, False, True]
+    assert tasks.nearness(before).tolist() == pytest.approx([-4, -4, -4, -0.2])

@@ -15,9 +15,9 @@ from sb3_sap.benchmark.reports.drawing import curve_figure
 from sb3_sap.benchmark.reports.figures import with_averages
 from sb3_sap.benchmark.reports.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
 from sb3_sap.benchmark.reports.results import collect
-from sb3_sap.benchmark.reports.rivals import rivals
 from sb3_sap.benchmark.reports.summary import improvement
 from sb3_sap.benchmark.reports.tables import curve_table
+from sb3_sap.benchmark.reports.ways import ways
 from sb3_sap.benchmark.runs import make_grid
 from sb3_sap.benchmark.store import write_result
 from sb3_sap.benchmark.training import LAP_COLUMNS
@@ -278,17 +278,12 @@ def test_the_page_of_claims_says_what_was_not_run(tmp_path):
     assert "Made by `sb3-sap benchmark claims`, from 5 runs" in page
 
 
-def test_rivals_of_the_recommended_settings(tmp_path):
-    names = ["ddpg_ap:base+penalty[penalty=0]", "ddpg_ap:base+recommended", "td3_ap:base+recommended"]
-    results = make(tmp_path, names, steps=1_000)
-    rivals(results, tmp_path, "command")
-    page = (tmp_path / "rivals.md").read_text(encoding="utf-8")
-    assert "| ddpg_ap:base+recommended | ddpg_ap:base+penalty[penalty=0] | " in page
-    assert "| ddpg_ap:base+recommended | td3_ap" not in page  # another algorithm is no rival
+def test_ways_of_using_the_label(tmp_path):
+    names = ["ddpg_ap:base+penalty[penalty=0]", "ddpg_ap:base+penalty", "ddpg_ap:base+loss", "td3_ap:base+loss"]
+    ways(make(tmp_path, names, steps=1_000), tmp_path, "command")
+    page = (tmp_path / "ways.md").read_text(encoding="utf-8")
+    assert "| ddpg_ap:base+loss | ddpg_ap:base+penalty | " in page
+    assert "| td3_ap:base+loss | " not in page.partition("## Probability")[2]  # whose penalty there is not
     assert "50.0%" in page  # of the steps were mistakes
-    assert {path.name for path in tmp_path.glob("rivals*")} == {
-        "rivals.md",
-        "rivals.svg",
-        "rivals.csv",
-        "rivals_improvement.csv",
-    }
+    found = {path.name for path in tmp_path.glob("ways*")}
+    assert found == {"ways.md", "ways.svg", "ways.csv", "ways_improvement.csv"}

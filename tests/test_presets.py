@@ -100,7 +100,7 @@ def test_every_algorithm_has_an_installed_configuration():
         (("fats",), "did you mean 'fast'"),
         (("fast",), r"preset\('fast', TQCAP\) or preset\('fast', 'tqc_ap'\)"),
         (("default",), "differs from algorithm to algorithm"),
-        (("paper", TQCAP), "`name` = 'paper' is unknown: choose one of 'default', 'penalty', 'recommended', 'fast'"),
+        (("paper", TQCAP), "`name` = 'paper' is unknown: choose one of 'default', 'penalty', 'loss', 'fast'"),
         (("fast", SAC), "`algo` = SAC is neither an algorithm of sb3_sap nor derived from one.*'tqc_ap'"),
         (("fast", dict), "`algo` = dict is neither"),
     ],

@@ -31,13 +31,13 @@ REPORTS = {
     "details": (["details"], "summary of details that the paper leaves open, one changed at a time"),
     "auxiliary": (["auxiliary"], "summary of how often the auxiliary actor loss is applied"),
     "robustness": (["robustness"], "summary at 80 km/h and from random starts, for which nothing was tuned"),
-    "rivals": (["rivals"], "the recommended settings, a reward penalty with the same label, and the base"),
+    "ways": (["ways"], "ways of using the label: none, as a reward penalty, a loss beside it, and guidance"),
     "wrong_labels": (["wrong_labels"], "the same for labels that are wrong"),
 }
 #: Reports that are summaries of other configurations.
 SUMMARIES = ("summary", "ablations", "details", "auxiliary", "robustness")
-#: Reports that compare the recommended settings with rivals.
-RIVALS = ("rivals", "wrong_labels")
+#: Reports that compare ways of using the label.
+WAYS = ("ways", "wrong_labels")
 #: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
 LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.
@@ -58,11 +58,11 @@ def report(options: argparse.Namespace, console: Console) -> int:
 
 def task(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of a task beyond lane keeping and writes its page."""
-    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, rivals_of, task_configurations
+    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, task_configurations, ways_of
 
     options.tracks = list(EPISODES)
     options.steps = options.steps or planned_steps(options.simulator)
-    compared = rivals_of if options.report == "rivals" else task_configurations
+    compared = ways_of if options.report == "ways" else task_configurations
     options.configurations = options.configurations or compared(options.simulator)
     failed = _run_missing(options, options.steps, console)
     _write(options, options.report, console)
@@ -115,7 +115,7 @@ def _run_missing(options: argparse.Namespace, steps: int, console: Console) -> i
 
 
 def _write(options: argparse.Namespace, name: str, console: Console, leave_out_unknown: bool = False) -> None:
-    from sb3_sap.benchmark.reports import figures, returns, rivals, summary, tables
+    from sb3_sap.benchmark.reports import figures, returns, summary, tables, ways
     from sb3_sap.benchmark.reports.results import collect
 
     folder = _folder(options, options.steps)
@@ -129,7 +129,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, leave_out_u
         "headline": tables.headline,
         **{kind: partial(summary.summary, name=kind) for kind in SUMMARIES},
         "returns": returns.returns,
-        **{kind: partial(rivals.rivals, kind=kind) for kind in RIVALS},
+        **{kind: partial(ways.ways, kind=kind) for kind in WAYS},
     }
     writers[name](results, folder, command_line(options, name))
     console.print(f"wrote {folder / name}.md", soft_wrap=True)
@@ -161,7 +161,7 @@ def _grid(options: argparse.Namespace, steps: int, console: Console | None = Non
     from sb3_sap.benchmark.runs import make_grid
 
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    later = LONG_LAPS if getattr(options, "report", None) in RIVALS else ()
+    later = LONG_LAPS if getattr(options, "report", None) in WAYS else ()
     grid: dict[Configuration, list[Run]] = {}
     left_out: dict[str, ValueError] = {}
     for configuration in parse_configurations(options.configurations):

@@ -1,6 +1,6 @@
 """Configurations, such as ``ddpg_ap:paper[alpha=0.5]``: an algorithm, a preset, and overrides of its settings.
 
-Presets may be joined, as in ``ddpg_ap:base+recommended``: later ones override earlier ones.
+Presets may be joined, as in ``ddpg_ap:base+loss``: later ones override earlier ones.
 """
 
 from __future__ import annotations

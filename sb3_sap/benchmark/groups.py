@@ -72,16 +72,16 @@ GROUPS: dict[str, list[str]] = {
         ),
         "linear[env.speed=80]",
     ],
-    # The recommended settings, and what a good engineer would try in one line: a penalty that was tuned for lane
-    # keeping (c = 50), the same penalty for all tasks, and none.
-    "rivals": [
+    # Ways of using the label: none, a penalty tuned for lane keeping (c = 50), one that suits all tasks, a loss
+    # beside it, and guidance.
+    "ways": [
         f"{algo}:{presets}"
         for algo in ("ddpg_ap", "td3_ap", "sac_ap", "tqc_ap")
         for presets in (
             "base+penalty[penalty=0]",
             "base+penalty[penalty=50]",
             "base+penalty",
-            "base+recommended",
+            "base+loss",
             "fast",
         )
     ],
@@ -91,7 +91,7 @@ GROUPS: dict[str, list[str]] = {
         *(
             f"ddpg_ap:base+{presets}[ap_function=sb3_sap.benchmark.wrong_labels.{labels}]"
             for labels in ("one_in_ten", "in_a_region")
-            for presets in ("penalty", "recommended")
+            for presets in ("penalty", "loss")
         ),
     ],
 }

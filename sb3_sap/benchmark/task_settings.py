@@ -28,10 +28,10 @@ LONGER = 10
 FEWER = 3
 #: Mean returns that count as a task's goal where the environment names none, or one that takes long to reach.
 GOALS = {"Pendulum-v1": -200.0, "Acrobot-v1": -100.0, "MountainCarContinuous-v0": 90.0, "MountainCar-v0": -110.0}
-#: The constant reward penalty that did best in a screening on design seeds, as a rival.
+#: The constant reward penalty that did best in a screening on design seeds.
 TUNED_PENALTIES = {"MountainCarContinuous-v0": 0.25, "Pendulum-v1": 0.5, "MountainCar-v0": 1.0, "Acrobot-v1": 1.0}
 #: Presets that are not for lane keeping alone.
-ANY_TASK = ("penalty", "recommended")
+ANY_TASK = ("penalty", "loss")
 #: Settings of guided algorithms that say how labels are used, and not what they are.
 GUIDANCE = (
     set(inspect.signature(ActionPermissibilityMixin).parameters) - set(inspect.signature(OffPolicyAlgorithm).parameters)
@@ -75,15 +75,15 @@ def task_configurations(env_id: str) -> list[str]:
     return configurations + (["oracle"] if "ap_function" in entry("oracle", env_id) else [])
 
 
-def rivals_of(env_id: str) -> list[str]:
-    """The recommended settings of the first guided algorithm with an entry, its rivals, and the entry itself."""
+def ways_of(env_id: str) -> list[str]:
+    """The ways of using the label with the first guided algorithm that has an entry, and the entry itself."""
     algo = guided_algorithms(env_id)[0]
     tuned = TUNED_PENALTIES.get(env_id)
     return [
         f"{algo}:base+penalty[penalty=0]",
         *([] if tuned is None else [f"{algo}:base+penalty[penalty={tuned:g}]"]),
         f"{algo}:base+penalty",
-        f"{algo}:base+recommended",
+        *([f"{algo}:base+loss"] if "loss" in preset_names(algo) else []),
         f"{algo}:task",
     ]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_sap.algorithms import ALGORITHMS, base_of
-from sb3_sap.presets import preset
+from sb3_sap.presets import preset, preset_names
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def ways(algo: str, potential: bool) -> list[Way]:
     :param potential: whether the user has given one
     """
     cls = ALGORITHMS[algo].__name__
-    penalty, recommended = preset("penalty", algo), preset("recommended", algo)
+    penalty = preset("penalty", algo)
     # Without a penalty and without guidance, the algorithm equals its base to the bit, and counts the mistakes.
     base = {**penalty, "penalty": 0.0}
     found = [
@@ -42,9 +42,9 @@ def ways(algo: str, potential: bool) -> list[Way]:
     if potential:
         code = f'**preset("penalty", {cls}) | {{"penalty": 0.0}}'
         found.append(Way("shaping", "the potential as reward shaping", base, code))
-    if recommended != penalty:
+    if "loss" in preset_names(algo):
         meaning = "the penalty, and a loss on the learned predictor that fades"
-        found.append(Way("recommended", meaning, recommended, f'**preset("recommended", {cls})'))
+        found.append(Way("loss", meaning, preset("loss", algo), f'**preset("loss", {cls})'))
     guided = {"refit_growth": 0.005, "n_candidates": 32}
     found.append(Way("guidance", "Algorithm 1 of the paper", guided, "refit_growth=0.005, n_candidates=32"))
     return found

@@ -27,7 +27,7 @@ def test_comparison_of_a_class_of_the_user(tmp_path):
         out=tmp_path,
         console=console,
     )
-    assert sorted(result.evaluations["way"].unique()) == ["base", "guidance", "penalty", "recommended"]
+    assert sorted(result.evaluations["way"].unique()) == ["base", "guidance", "loss", "penalty"]
     assert len(result.evaluations) == 4 * 2 * 10
     assert (tmp_path / "curves.png").stat().st_size > 1000
     assert "Use " in result.decision

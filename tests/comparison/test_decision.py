@@ -65,7 +65,7 @@ def test_table_has_a_row_for_each_way_and_files_are_written(tmp_path):
 
 def test_ways_of_finite_actions_hold_no_loss_and_shaping_needs_a_potential():
     assert [way.name for way in ways("dqn_ap", potential=True)] == ["base", "penalty", "shaping", "guidance"]
-    assert [way.name for way in ways("td3_ap", potential=False)] == ["base", "penalty", "recommended", "guidance"]
+    assert [way.name for way in ways("td3_ap", potential=False)] == ["base", "penalty", "loss", "guidance"]
 
 
 @pytest.mark.parametrize("algo", ["ddpg_ap", "dqn_ap"])

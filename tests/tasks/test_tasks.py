@@ -7,6 +7,7 @@ import pytest
 
 from sb3_sap import check_permissibility, tasks
 from sb3_sap.common.functions import resolve
+from sb3_sap.evaluation import make_env
 from sb3_sap.presets import algorithms, load_config
 from sb3_sap.tasks.driving import SCALES, approach_speed, passing_distance
 from sb3_sap.tasks.energy import acrobot_energy, flag_within_reach
@@ -201,7 +202,7 @@ ENTRIES = [
 
 @pytest.mark.parametrize(("algo", "env_id", "entry"), ENTRIES, ids=[f"{a}-{e}" for a, e, _ in ENTRIES])
 def test_configured_ap_functions_give_both_labels_in_their_environments(algo, env_id, entry):
-    env = gym.make(env_id, **entry.get("env_kwargs", {}))
+    env = make_env(env_id, **entry.get("env_kwargs", {}))
     transitions = []
     obs, _ = env.reset(seed=0)
     actions = env.action_space  # highway-env replaces it by an unseeded one at every reset

@@ -1,4 +1,4 @@
-"""The page that compares the recommended settings with what a good engineer would try in one line."""
+"""The page that compares ways of using the label: none, as a reward penalty, a loss beside it, and guidance."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sb3_sap.benchmark.configurations import Configuration
 from sb3_sap.benchmark.reports.drawing import line_figure
 from sb3_sap.benchmark.reports.measures import LOST, median_reached, ms_per_step, steps_to_competence
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_figure, write_page
@@ -21,6 +22,8 @@ from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 #: Shares of the training after which the score is told.
 SHARES = (0.25, 0.5, 1.0)
+#: The presets of a penalty alone.
+PENALTY = "base+penalty"
 #: S on every track from which a lap-driving policy has learned the task.
 GOOD = 0.95
 NOTE = (
@@ -35,7 +38,7 @@ NOTE = (
 )
 
 
-def rivals(results: Results, folder: Path, command: str, kind: str = "rivals") -> None:
+def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> None:
     """Writes ``KIND.md``, ``KIND.svg``, ``KIND.csv`` with a row for every run and checkpoint, and
     ``KIND_improvement.csv``.
     """
@@ -59,10 +62,10 @@ def rivals(results: Results, folder: Path, command: str, kind: str = "rivals") -
         else f"goal (a mean return of {_goal(results):g})",
     )
     parts = [f"![Scores over training steps]({kind}.svg)\n", markdown(pd.DataFrame(rows)), note]
-    parts += ["## Probability that a run with the recommended settings ends better than a rival's\n"]
+    parts += ["## Probability that a run ends better than one with the penalty\n"]
     intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
     parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
-    title = "The recommended settings and their rivals" + (", with wrong labels" if kind == "wrong_labels" else "")
+    title = "Ways of using the label" + (", with wrong labels" if kind == "wrong_labels" else "")
     title = f"{title} ({results.simulator}, {results.steps:,} steps)"
     write_page(folder / f"{kind}.md", title, parts, results, command)
 
@@ -79,19 +82,17 @@ def run_scores(results: Results) -> pd.DataFrame:
 
 
 def improvement(results: Results, scores: pd.DataFrame) -> pd.DataFrame:
-    """Compares the recommended configuration of each algorithm with its other ones, at the end.
+    """Compares each configuration with the penalty that suits all tasks, for the same algorithm, at the end.
 
-    :return: columns ``recommended``, ``against``, ``probability``, ``low`` and ``high``
+    :return: columns ``configuration``, ``against``, ``probability``, ``low`` and ``high``
     """
     rows = []
     for ours in results.configurations:
-        if "recommended" not in ours.preset:
-            continue
-        for other in results.configurations:
-            if other.algo == ours.algo and other != ours:
-                estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, other.name, 1.0))
-                rows.append([ours.name, other.name, *estimate])
-    return pd.DataFrame(rows, columns=["recommended", "against", "probability", "low", "high"])
+        penalty = Configuration(ours.algo, PENALTY).name
+        if penalty in results.names and penalty != ours.name:
+            estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, penalty, 1.0))
+            rows.append([ours.name, penalty, *estimate])
+    return pd.DataFrame(rows, columns=["configuration", "against", "probability", "low", "high"])
 
 
 def _goal(results: Results) -> float:

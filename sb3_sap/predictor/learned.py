@@ -136,7 +136,7 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         super().save(path, exclude, include)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts, variables = super()._get_torch_save_params()  # type: ignore[safe-super]
+        state_dicts, variables = super()._get_torch_save_params()
         return [*state_dicts, "predictor", "predictor.optimizer"], variables
 
     def _excluded_save_params(self) -> list[str]:

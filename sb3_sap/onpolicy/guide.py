@@ -30,7 +30,6 @@ class Guide:
     :param squashed: whether the policy's actions are scaled to [-1, 1]
     :param device: of the policy
     :param predicts: whether ``predict`` is guided, too
-    :param logger: where rates are recorded; ``None``: nowhere
     """
 
     def __init__(
@@ -41,14 +40,14 @@ class Guide:
         squashed: bool,
         device: th.device,
         predicts: bool = False,
-        logger: Logger | None = None,
     ):
         self.predictor = predictor
         self.space = space
         self.n_candidates = n_candidates
         self.squashed = squashed
         self.predicts = predicts
-        self.logger = logger
+        #: Where rates are recorded; ``None``: nowhere.
+        self.logger: Logger | None = None
         self.actions = None if isinstance(space, spaces.Box) else joint_actions(space).to(device)
 
     def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
@@ -113,8 +112,7 @@ class Guide:
         normal = distribution.distribution
         # gSDE's own noise is the same at every call: this is its distribution over many.
         own = th.distributions.Normal(normal.mean[rows], normal.stddev[rows])
-        drawn: th.Tensor = own.sample(th.Size([self.n_candidates - 1]))  # type: ignore[no-untyped-call]
-        drawn = drawn.transpose(0, 1)
+        drawn = own.sample(th.Size([self.n_candidates - 1])).transpose(0, 1)  # type: ignore[no-untyped-call]
         bijector = getattr(distribution, "bijector", None)
         return drawn if bijector is None else bijector.forward(drawn)  # type: ignore[no-any-return]
 

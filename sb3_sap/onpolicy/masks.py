@@ -72,9 +72,9 @@ class MaskedDistribution(Distribution):
     distribution: Categorical
 
     def __init__(self, log_probs: th.Tensor, mask: th.Tensor, space: spaces.Space[Any], actions: th.Tensor):
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         rejected = th.tensor(REJECTED_LOGIT, dtype=log_probs.dtype, device=log_probs.device)
-        self.distribution = Categorical(logits=th.where(mask, log_probs, rejected))  # type: ignore[no-untyped-call]
+        self.distribution = Categorical(logits=th.where(mask, log_probs, rejected))
         self.space = space
         self.actions = actions
 

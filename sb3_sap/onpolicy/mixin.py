@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self, cast
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -97,6 +98,11 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
+        if any(base is OffPolicyAlgorithm for base in cls.__mro__):
+            raise TypeError(
+                f"{cls.__name__} puts {cls.__bases__[0].__name__} before an off-policy algorithm: choose an on-policy "
+                "one, such as PPO, or put ActionPermissibilityMixin before it."
+            )
         # The constructors pass *args and **kwargs on; editors and API pages should show the whole list.
         cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
 
@@ -228,18 +234,21 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         """Whether E is accurate enough for anything to follow its verdicts."""
         return self.predictor.fitted and self.predictor_accurate
 
-    def _guide(self, **settings: Any) -> Guide:
-        policy = self.policy
-        return Guide(
-            self.predictor, self.action_space, self.n_candidates, policy.squash_output, self.device, **settings
-        )
+    def _guide(self, predicts: bool = False) -> Guide:
+        squashed = self.policy.squash_output
+        guide = Guide(self.predictor, self.action_space, self.n_candidates, squashed, self.device, predicts)
+        guide.logger = None if predicts else self.logger
+        return guide
 
     @contextmanager
-    def _guidance(self, guides: bool, **settings: Any) -> Iterator[None]:
-        """Within the block, the policy is guided, or is not."""
+    def _guidance(self, guides: bool, predicts: bool = False) -> Iterator[None]:
+        """Within the block, the policy is guided, or is not.
+
+        :param predicts: whether that holds for ``predict``
+        """
         policy = cast(GuidedPolicyMixin, self.policy)
         before = policy.guide
-        policy.guide = self._guide(**({"logger": self.logger} | settings)) if guides else None
+        policy.guide = self._guide(predicts) if guides else None
         try:
             yield
         finally:
@@ -259,5 +268,5 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         """
         if not (guided and self.predictor.fitted):
             return super().predict(observation, state, episode_start, deterministic)
-        with self._guidance(True, predicts=True, logger=None):
+        with self._guidance(True, predicts=True):
             return super().predict(observation, state, episode_start, deterministic)

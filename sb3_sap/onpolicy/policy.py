@@ -68,8 +68,9 @@ class GuidedPolicyMixin(ActorCriticPolicy):
         return self.guide.distribution(obs, distribution, executed)
 
     def __reduce__(self) -> Any:
-        # By name, the class below cannot be found.
-        return _new, (type(self).__mro__[2],), self.__dict__
+        # The class cannot be found by its name, and a copy made amid a rollout is the policy alone.
+        state = {name: value for name, value in vars(self).items() if name not in ("guide", "_pass")}
+        return _new, (type(self).__mro__[2],), state
 
 
 @cache

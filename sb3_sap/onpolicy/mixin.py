@@ -32,6 +32,7 @@ from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permiss
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import LabelledTransitions
 from sb3_sap.predictor.learned import LearnedPredictorMixin
+from sb3_sap.predictor.schedule import weighted_labels
 
 #: Maximum number of combinations of a MultiDiscrete or MultiBinary action, each of which E judges in each state.
 MOST_COMBINATIONS = 4_096
@@ -55,7 +56,8 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
 
     :param alpha: 1: E guides once its balanced validation accuracy is 70 %; 0: never
     :param n_candidates: number of draws from a policy of continuous actions
-    :param predictor_epochs: how often, on average, a fit of E sees each labelled action, like ``n_epochs`` of PPO
+    :param predictor_epochs: how often, on average, fits of E see each labelled action, like ``n_epochs`` of PPO; the
+        first 2,000 count four times (:func:`~sb3_sap.predictor.schedule.weighted_labels`)
     :param permissibility_coef: β of a loss towards permissible actions after each update of the policy
         (:func:`~sb3_sap.onpolicy.loss.permissibility_passes`), a number, a schedule, or ``"lin_1.0_0.5"``, which fades
         to 0 in the middle of ``learn``: a label that a good policy sometimes violates would bias the end. It is
@@ -215,11 +217,12 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
             self.logger.record("sap/permissibility_loss", loss)
 
     def _refit(self) -> None:
-        """Fits E so often that it sees each new example ``predictor_epochs`` times on average."""
+        """Fits E so often that it sees each new label as often as ``predictor_epochs`` says, on average."""
         seen = sum(self.knowledge.seen)
-        due = self._examples_due + self.predictor_epochs * (seen - self._labels_seen)
+        new = weighted_labels(seen) - weighted_labels(self._labels_seen)
+        due = self._examples_due + self.predictor_epochs * new
         # While one class is missing the fits remain due, as many as K can make use of.
-        self._examples_due = min(due, self.predictor_epochs * len(self.knowledge))
+        self._examples_due = min(due, self.predictor_epochs * weighted_labels(len(self.knowledge)))
         self._labels_seen = seen
         enough = min(self.knowledge.counts("train")) >= self.min_per_class
         fits = int(self._examples_due // self.dataset_size)

@@ -9,7 +9,8 @@ from gymnasium import spaces
 from rollouts import BASES, Recorder, build_on_policy
 from toy import Line
 
-from sb3_sap import A2CAP, PPOAP, OnPolicyPermissibilityMixin
+from sb3_sap import A2CAP, PPOAP, OnPolicyPermissibilityMixin, preset
+from sb3_sap.presets import preset_names
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,13 @@ def test_missing_label_is_an_error():
 def test_off_policy_algorithm_is_refused():
     with pytest.raises(TypeError, match=r"^Mine puts OnPolicyPermissibilityMixin before an off-policy algorithm"):
         type("Mine", (OnPolicyPermissibilityMixin, stable_baselines3.SAC), {})
+
+
+@pytest.mark.parametrize("name", ["default", "penalty", "recommended"])
+def test_model_is_built_from_each_preset(name):
+    assert preset_names(PPOAP) == ["default", "penalty", "recommended"]
+    model = PPOAP("MlpPolicy", Line(), **preset(name, PPOAP))
+    assert model.penalty == ("auto" if name == "penalty" else 0.0)
 
 
 def test_schedules_may_be_written_as_in_yaml():

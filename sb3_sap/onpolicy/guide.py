@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.logger import Logger
 
+from sb3_sap.common.arrays import BoolArray, rows_of
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.candidates import stratified_candidates
 from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_actions, joint_log_probs
@@ -48,6 +49,7 @@ class Guide:
         self.predicts = predicts
         #: Where rates are recorded; ``None``: nowhere.
         self.logger: Logger | None = None
+        self._known: dict[bytes, BoolArray] = {}  # masks of states that were judged
         self.actions = None if isinstance(space, spaces.Box) else joint_actions(space).to(device)
 
     def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
@@ -64,9 +66,9 @@ class Guide:
             guided = copy.copy(distribution)
             guided.get_actions = partial(self.first_permissible, obs, distribution)  # type: ignore[method-assign]
             return guided
-        mask = permitted(self.predictor, obs, self.actions)
+        mask = self.mask(obs)
         if executed is not None:
-            # E's verdict at the border may depend on the size of the batch; what was executed was permitted.
+            # Where a state is judged anew, E's verdict at the border may depend on the size of the batch.
             mask[th.arange(len(mask), device=mask.device), index_of(self.space, executed)] = True
         if mask.all():
             return distribution
@@ -75,6 +77,19 @@ class Guide:
             rejected = log_probs.detach().masked_fill(mask, -th.inf).exp().sum(dim=1)
             self._record("sap/rejection_rate", rejected.mean().item())
         return MaskedDistribution(log_probs, mask, self.space, self.actions)
+
+    def mask(self, obs: Any) -> th.Tensor:
+        """(n, k) bool, which of all k actions are permitted in n states.
+
+        E is fixed, and an update sees each state of the rollout several times: each is judged once.
+        """
+        assert self.actions is not None
+        states = _rows_as_bytes(obs)
+        new = [row for row, state in enumerate(states) if state not in self._known]
+        if new:
+            judged = permitted(self.predictor, rows_of(obs, new), self.actions).cpu().numpy()
+            self._known.update(zip((states[row] for row in new), judged, strict=True))
+        return th.as_tensor(np.stack([self._known[state] for state in states]), device=self.actions.device)
 
     @th.no_grad()
     @flush_denormals()
@@ -146,6 +161,13 @@ class Guide:
     def _record(self, name: str, value: float) -> None:
         if self.logger is not None:
             self.logger.record_mean(name, value)
+
+
+def _rows_as_bytes(obs: Any) -> list[bytes]:
+    """What tells each of n states from the others."""
+    arrays = [value.cpu().numpy() for value in (obs.values() if isinstance(obs, dict) else [obs])]
+    rows = [[row.tobytes() for row in array] for array in arrays]
+    return [b"".join(parts) for parts in zip(*rows, strict=True)]
 
 
 @th.no_grad()

@@ -10,7 +10,7 @@ from stable_baselines3.common.distributions import Distribution
 from torch.nn import functional as F
 
 from sb3_sap.common.torch_utils import flush_denormals
-from sb3_sap.onpolicy.guide import Guide, permitted
+from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.masks import joint_log_probs
 
 
@@ -65,5 +65,5 @@ def losses(guide: Guide, obs: Any, distribution: Distribution) -> th.Tensor:
         free = mode if guide.squashed else guide.scaled_freely(mode)
         features = guide.predictor.features(obs).detach()
         return F.softplus(-guide.predictor.logits(features, free + (clipped - free).detach()))
-    mask = permitted(guide.predictor, obs, guide.actions)
+    mask = guide.mask(obs)
     return -joint_log_probs(distribution, guide.actions).masked_fill(~mask, -th.inf).logsumexp(dim=1)

@@ -57,7 +57,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
     :param alpha: 1: E guides once its balanced validation accuracy is 70 %; 0: never
     :param n_candidates: number of draws from a policy of continuous actions
     :param predictor_epochs: how often, on average, fits of E see each labelled action, like ``n_epochs`` of PPO; the
-        first 2,000 count four times (:func:`~sb3_sap.predictor.schedule.weighted_labels`)
+        first 2,000 count eight times (:func:`~sb3_sap.predictor.schedule.weighted_labels`)
     :param permissibility_coef: β of a loss towards permissible actions after each update of the policy
         (:func:`~sb3_sap.onpolicy.loss.permissibility_passes`), a number, a schedule, or ``"lin_1.0_0.5"``, which fades
         to 0 in the middle of ``learn``: a label that a good policy sometimes violates would bias the end. It is
@@ -78,7 +78,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         *args: Any,
         alpha: float = 1.0,
         n_candidates: int = 32,
-        predictor_epochs: float = 10,
+        predictor_epochs: float = 5,
         permissibility_coef: float | Schedule | str = 0.0,
         permissibility_epochs: int = 4,
         **kwargs: Any,
@@ -90,7 +90,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         self.permissibility_epochs = permissibility_epochs
         #: Holds K; saved with the model.
         self.labelled = cast(LabelledTransitions, None)
-        self._guides = False  # whether E guides the rollout in progress, and thus its update
+        self._rollout_guide: Guide | None = None  # of the rollout in progress, and thus of its update
         self._labels_seen = 0  # labels that fits of E are due for or were made for
         self._examples_due = 0.0  # examples that E has yet to see
         self._label_callback = LabelCallback()
@@ -170,7 +170,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         self._set_label_source(self.labelled)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_label_callback", "_fit_callback"]
+        return [*super()._excluded_save_params(), "_label_callback", "_fit_callback", "_rollout_guide"]
 
     # ---------------------------------------------------------------- learning
 
@@ -201,14 +201,14 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, rollout_buffer: Any, n_rollout_steps: int) -> Any:
         """SB3's ``collect_rollouts``, guided while E is accurate, with the labels' share in the stored rewards."""
-        self._guides = bool(self.alpha) and self._judges
-        self.logger.record("sap/alpha", float(self._guides))
-        with self._guidance(self._guides), shaped_rewards(rollout_buffer, self._label_callback):
+        self._rollout_guide = self._guide() if self.alpha and self._judges else None
+        self.logger.record("sap/alpha", float(self._rollout_guide is not None))
+        with self._guided_by(self._rollout_guide), shaped_rewards(rollout_buffer, self._label_callback):
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
         """SB3's ``train`` with the masks of the rollout; then fits of E, and the loss towards permissible actions."""
-        with self._guidance(self._guides):
+        with self._guided_by(self._rollout_guide):
             super().train()
         self._refit()
         coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining)
@@ -244,14 +244,10 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         return guide
 
     @contextmanager
-    def _guidance(self, guides: bool, predicts: bool = False) -> Iterator[None]:
-        """Within the block, the policy is guided, or is not.
-
-        :param predicts: whether that holds for ``predict``
-        """
+    def _guided_by(self, guide: Guide | None) -> Iterator[None]:
+        """Within the block, the policy is guided; ``None``: it is not."""
         policy = cast(GuidedPolicyMixin, self.policy)
-        before = policy.guide
-        policy.guide = self._guide(predicts) if guides else None
+        before, policy.guide = policy.guide, guide
         try:
             yield
         finally:
@@ -271,5 +267,5 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         """
         if not (guided and self.predictor.fitted):
             return super().predict(observation, state, episode_start, deterministic)
-        with self._guidance(True, predicts=True):
+        with self._guided_by(self._guide(predicts=True)):
             return super().predict(observation, state, episode_start, deterministic)

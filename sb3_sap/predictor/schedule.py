@@ -7,7 +7,7 @@ from numbers import Real
 from typing import Any
 
 #: Labels that count more than later ones where fits are in proportion to what is new, and how much more.
-EARLY_LABELS, EARLY_WEIGHT = 2_000, 4
+EARLY_LABELS, EARLY_WEIGHT = 2_000, 8
 
 
 def due(growth: float, before: int, now: int, every: int = 1, max_gap: float = math.inf) -> int:

@@ -60,7 +60,7 @@ def test_where_nothing_is_permitted_everything_is(space):
 def test_same_seed_gives_the_same_bits_and_guidance_another_run():
     settings = {"permissibility_coef": 1.0, "penalty": "auto"}
     one, same = (build_on_policy(PPOAP, Line(n_actions=3), **settings).learn(160) for _ in range(2))
-    assert one._guides
+    assert one._rollout_guide is not None
     assert_same_learning(one, same)
     for name, value in one.predictor.state_dict().items():
         assert th.equal(value, same.predictor.state_dict()[name])

@@ -126,29 +126,29 @@ class Fits(PermissibilityCallback):
 
 def test_fits_follow_each_update_in_proportion_to_the_new_labels():
     callback = Fits()
-    model = build_on_policy(PPOAP, Line(n_actions=3), predictor_epochs=0.5)
+    model = build_on_policy(PPOAP, Line(n_actions=3), predictor_epochs=0.25)
     model.learn(64, callback)
-    # 16 new labels, which count four times, are at half an epoch two samples of 16; an update has two epochs.
+    # 16 new labels, which count eight times, are at a quarter of an epoch two samples of 16; an update has two epochs.
     assert [steps for steps, _ in callback.found] == [16, 16, 32, 32, 48, 48, 64, 64]
     assert [updates for _, updates in callback.found] == [2, 2, 4, 4, 6, 6, 8, 8]
 
 
 def test_fits_of_short_rollouts_accumulate():
     callback = Fits()
-    build_on_policy(A2CAP, Line(n_actions=3), n_steps=4, predictor_epochs=0.25).learn(64, callback)
+    build_on_policy(A2CAP, Line(n_actions=3), n_steps=4, predictor_epochs=0.125).learn(64, callback)
     assert [steps for steps, _ in callback.found] == [16, 32, 48, 64]
 
 
 def test_fits_wait_for_both_classes_and_then_are_bounded_by_what_k_holds():
     callback = Fits()
-    model = build_on_policy(PPOAP, predictor_epochs=0.25, ap_function=never_labels, knowledge_buffer_size=40)
+    model = build_on_policy(PPOAP, predictor_epochs=0.125, ap_function=never_labels, knowledge_buffer_size=40)
     model.learn(160, callback)
     assert callback.found == []
     assert model._examples_due == len(model.knowledge) <= 40
 
 
-def test_first_labels_count_four_times():
-    assert [weighted_labels(n) for n in (0, 1, 2000, 2001, 10_000)] == [0, 4, 8000, 8001, 16_000]
+def test_first_labels_count_eight_times():
+    assert [weighted_labels(n) for n in (0, 1, 2000, 2001, 10_000)] == [0, 8, 16_000, 16_001, 24_000]
 
 
 def test_loss_of_finite_actions_is_that_of_the_permitted_probability():

@@ -82,7 +82,7 @@ def settings(algorithm: Any, **overrides: Any) -> dict[str, Any]:
 
 def build_on_policy(algorithm: Any, env: Any = None, **overrides: Any) -> Any:
     recurrent = algorithm in (RecurrentPPOAP, BASES[RecurrentPPOAP])
-    policy = "MlpLstmPolicy" if recurrent else "MlpPolicy"
+    policy = overrides.pop("policy", "MlpLstmPolicy" if recurrent else "MlpPolicy")
     return algorithm(policy, Line() if env is None else env, **settings(algorithm, **overrides))
 
 

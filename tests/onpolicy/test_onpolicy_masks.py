@@ -46,6 +46,24 @@ def test_four_environments_are_judged_in_one_query():
     assert all((step + int(action)) % 2 == 0 for env in envs for step, action in env.executed)
 
 
+def test_dict_observations_are_judged_row_by_row():
+    env = Line(kind="dict", n_actions=3)
+    model = judged_by(  # the rightmost action is rejected in the second half of an episode
+        lambda features, actions: 1.0 - 2.0 * ((features >= 0.45) & (actions[:, 0] == 2)),
+        PPOAP,
+        env,
+        policy="MultiInputPolicy",
+    )
+    model.predictor.features = lambda obs: obs["time"][:, 0]
+    model.learn(32)
+    late, early = (
+        [int(a) for step, a in enumerate(env.executed) if (step % 10 >= 5) == half] for half in (True, False)
+    )
+    assert set(early) == {0, 1, 2}
+    assert set(late) == {0, 1}
+    assert model.predictor.queries == [3] * 32  # each state once, and none again in the update
+
+
 def test_same_mask_gives_the_trajectory_of_maskable_ppo():
     env, other = Recorder(spaces.Discrete(4)), Recorder(spaces.Discrete(4))
     ours = judged_by(even, PPOAP, env, ent_coef=0.01).learn(64)

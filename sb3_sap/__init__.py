@@ -21,6 +21,8 @@ from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 from sb3_sap.guidance.wrapper import LearnedPermissibility
+from sb3_sap.onpolicy.algorithms import A2CAP, PPOAP, TRPOAP, RecurrentPPOAP
+from sb3_sap.onpolicy.mixin import OnPolicyPermissibilityMixin
 from sb3_sap.permissibility import ActionPermissibility, does_not_lower
 from sb3_sap.predictor.buffers import (
     KnowledgeMixin,
@@ -47,16 +49,19 @@ def __getattr__(name: str) -> object:
 
 __version__ = "0.1.0"
 __all__ = [
+    "A2CAP",
     "DDPG",
     "DDPGAP",
     "DDPGAPCE2",
     "DDPGCE1",
     "DDPGCE2",
     "DQNAP",
+    "PPOAP",
     "QRDQNAP",
     "SACAP",
     "TD3AP",
     "TQCAP",
+    "TRPOAP",
     "ActionPermissibility",
     "ActionPermissibilityMixin",
     "ConstrainedExplorationMixin",
@@ -66,6 +71,7 @@ __all__ = [
     "KnowledgeMixin",
     "LearnedPermissibility",
     "LearnedPermissibilityMixin",
+    "OnPolicyPermissibilityMixin",
     "PermissibilityCallback",
     "PermissibilityDictReplayBuffer",
     "PermissibilityHerReplayBuffer",
@@ -73,6 +79,7 @@ __all__ = [
     "PermissibilityPredictor",
     "PermissibilityReplayBuffer",
     "PermissibilityReport",
+    "RecurrentPPOAP",
     "RescaleExtractor",
     "check_permissibility",
     "compare",

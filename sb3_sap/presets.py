@@ -94,9 +94,11 @@ def _zoo_name(algo: str | type) -> str:
     """The RL Zoo name of an algorithm, or of the algorithm of this package that a class is derived from."""
     if not isinstance(algo, type):
         return algo
-    from sb3_sap.algorithms import ALGORITHMS  # here, so that commands read presets without loading every algorithm
+    # Here, so that commands read presets without loading every algorithm.
+    from sb3_sap.algorithms import ALGORITHMS
+    from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
-    names = {known: name for name, known in ALGORITHMS.items()}
+    names: dict[type, str] = {known: name for name, known in (*ALGORITHMS.items(), *ON_POLICY_ALGORITHMS.items())}
     for ancestor in algo.__mro__:
         if ancestor in names:
             return names[ancestor]

@@ -20,6 +20,7 @@ LAYERS = (
     {"plots", "evaluation"},
     {"presets"},
     {"algorithms"},
+    {"onpolicy"},
     {"guidance", "check"},
     {"predictor"},
     {"permissibility"},

@@ -10,6 +10,7 @@ from toy import DISCRETE
 from sb3_sap import DDPGAP, SACAP, TQCAP
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.benchmark.learners import CLASSES
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.presets import algorithms, load_config, preset, preset_names
 
 PAPER = {
@@ -83,7 +84,7 @@ def test_fast_preset_differs_between_algorithms():
 
 
 def test_every_algorithm_has_an_installed_configuration():
-    assert set(ALGORITHMS) <= set(algorithms()) <= set(CLASSES)
+    assert set(ALGORITHMS) <= set(algorithms()) <= {*CLASSES, *ON_POLICY_ALGORITHMS}
     for algo in ALGORITHMS:
         assert ("paper" in preset_names(algo)) == algo.startswith("ddpg")
         steering = {"sap/LaneKeeping-v0", "sap/TorcsLaneKeeping-v0"}

@@ -8,7 +8,6 @@ from gymnasium import spaces
 from sb3_contrib import QRDQN
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -17,7 +16,7 @@ from sb3_sap.common.vec_envs import channels_last, check_wrappers, environment_l
 
 
 class EnvironmentMixin(BaseAlgorithm):
-    """Checks the environment. Goes before an SB3 off-policy algorithm in the bases of a class."""
+    """Checks the environment. Goes before an SB3 algorithm in the bases of a class."""
 
     #: Whether the algorithm is for discrete actions; inferred for SB3's and sb3-contrib's bases.
     discrete: ClassVar[bool] = False
@@ -27,7 +26,7 @@ class EnvironmentMixin(BaseAlgorithm):
         self.images: tuple[str, ...] = ()
         if env is not None:
             env = maybe_make_env(env, kwargs.get("verbose", 0))
-            check_action_space(type(self).__name__, env.action_space, self.discrete)
+            self._check_action_space(env.action_space)
             check_observation_space(type(self).__name__, env.observation_space)
             if policy == "MultiInputPolicy" and not isinstance(env.observation_space, spaces.Dict):
                 raise ValueError(
@@ -46,13 +45,12 @@ class EnvironmentMixin(BaseAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
-        if any(base is OnPolicyAlgorithm for base in cls.__mro__):
-            raise TypeError(
-                f"{cls.__name__} puts {cls.__bases__[0].__name__} before an on-policy algorithm, which has no replay "
-                "buffer to learn from: choose an off-policy one, such as SAC or DQN."
-            )
         if issubclass(cls, (DQN, QRDQN)):
             cls.discrete = True
+
+    def _check_action_space(self, space: spaces.Space[Any]) -> None:
+        """Raises a ``ValueError`` for an action space that the algorithm cannot use."""
+        check_action_space(type(self).__name__, space, self.discrete)
 
     def _setup_model(self) -> None:
         self._inspect(self.env)

@@ -7,7 +7,7 @@ import inspect
 import warnings
 from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -24,6 +24,9 @@ HELD = ("ent_coef", "use_sde")
 class SavingMixin(BaseAlgorithm):
     """Checks what is saved and loaded. Goes before an SB3 algorithm in the bases of a class."""
 
+    #: Settings that `load` cannot change.
+    held: ClassVar[tuple[str, ...]] = HELD
+
     def __init__(self, *args: Any, **kwargs: Any):
         self._held: dict[str, Any] = {}
         self._unsaved: list[str] = []
@@ -31,7 +34,7 @@ class SavingMixin(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         # Here and not in the constructor, because `load(**kwargs)` bypasses the constructor.
-        held = {name: getattr(self, name) for name in HELD if hasattr(self, name)}
+        held = {name: getattr(self, name) for name in self.held if hasattr(self, name)}
         for name in held:
             if self._held.get(name, held[name]) != held[name]:
                 raise ValueError(

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self, cast
 import torch as th
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
@@ -53,6 +54,11 @@ class SettingsMixin(EnvironmentMixin, SavingMixin, OffPolicyAlgorithm):
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
+        if any(base is OnPolicyAlgorithm for base in cls.__mro__):
+            raise TypeError(
+                f"{cls.__name__} puts {cls.__bases__[0].__name__} before an on-policy algorithm, which has no replay "
+                "buffer to learn from: choose an off-policy one, such as SAC or DQN."
+            )
         # The constructors pass *args and **kwargs on; editors and API pages should show the whole list.
         cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,40 @@ def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool 
             )
     elif isinstance(space, spaces.Box):
         _check_box(algorithm, space)
+
+
+def check_any_action_space(algorithm: str, space: spaces.Space[Any], most: int) -> None:
+    """Checks that an on-policy algorithm can judge each action of a space.
+
+    :param algorithm: its name, for the error message
+    :param most: maximum number of combinations of a ``MultiDiscrete`` or ``MultiBinary`` space
+    :raise ValueError: if the algorithm cannot use the space
+    """
+    if isinstance(space, (spaces.Box, spaces.Discrete)):
+        check_action_space(algorithm, space, discrete=None)
+        return
+    if not isinstance(space, (spaces.MultiDiscrete, spaces.MultiBinary)) or len(space.shape) != 1:
+        raise ValueError(
+            f"{algorithm} needs an `env` with a Box, Discrete, or one-dimensional MultiDiscrete or MultiBinary action "
+            f"space, but this one's is {space}: wrap the environment in gymnasium.wrappers.TransformAction."
+        )
+    if np.any(getattr(space, "start", 0)):
+        raise ValueError(
+            f"{algorithm} needs actions that count from 0, as SB3's algorithms do, but this `env` has {space}: add "
+            "`start` in gymnasium.wrappers.TransformAction."
+        )
+    combinations = number_of_combinations(space)
+    if combinations > most:
+        raise ValueError(
+            f"{algorithm} judges every combination of actions, of which there may be at most {most:,}, but {space} has "
+            f"{combinations:,}: leave out or coarsen some dimensions of the action space."
+        )
+
+
+def number_of_combinations(space: spaces.MultiDiscrete | spaces.MultiBinary) -> int:
+    """The number of joint actions of a finite space of several dimensions."""
+    sizes = space.nvec.tolist() if isinstance(space, spaces.MultiDiscrete) else [2] * space.shape[0]
+    return math.prod(sizes)
 
 
 def _hint(space: spaces.Space[Any]) -> str:

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_sap.common.settings import SettingsMixin
+from sb3_sap.common.environment import EnvironmentMixin
 from sb3_sap.common.vec_envs import is_at, never_updated, shares_environment, watched_steps
 
 
-class WatchedEnvironmentMixin(SettingsMixin):
+class WatchedEnvironmentMixin(EnvironmentMixin):
     """Gives the buffers each episode's raw last observation, and warns of what would silently corrupt their data."""
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -55,11 +55,11 @@ class WatchedEnvironmentMixin(SettingsMixin):
                 self._warn_of_shared_environment(type(each).__name__)
         return combined
 
-    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> Any:
         """SB3's ``collect_rollouts``, with raw last observations and a warning if other code steps the environment."""
         before = self.num_timesteps
         with watched_steps(env, self._vec_normalize_env) as calls:
-            rollout = super().collect_rollouts(env, *args, **kwargs)
+            rollout = cast(Any, super()).collect_rollouts(env, *args, **kwargs)
         if calls[0] > (self.num_timesteps - before) // self.n_envs:
             self._warn_of_shared_environment("a callback")
         return rollout

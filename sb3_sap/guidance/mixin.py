@@ -20,6 +20,7 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
         AuxiliaryLossMixin           the same with updates of its own
         GuidedExplorationMixin       Algorithm 1
         LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E
+        LearnedPredictorMixin        settings of K and E, saving of E
         WatchedEnvironmentMixin      raw last observations, warnings about the training environment
         ConstrainedExplorationMixin  constraints and permissible actions
         SettingsMixin                settings that SB3 lacks
@@ -34,6 +35,7 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
     :class:`~sb3_sap.guidance.permissibility_loss.PermissibilityLossMixin`,
     :class:`~sb3_sap.guidance.auxiliary_update.AuxiliaryLossMixin`,
     :class:`~sb3_sap.predictor.mixin.LearnedPermissibilityMixin`,
+    :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin`,
     :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin` and
     :class:`~sb3_sap.common.settings.SettingsMixin`, beside those of the base algorithm.
     """

@@ -12,9 +12,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
-from sb3_sap.common.vec_envs import RAW_LAST, environment_layout
-from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
+from sb3_sap.common.vec_envs import environment_layout
+from sb3_sap.permissibility import APFunction, query_labels
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.labelling import take_in, unscaled
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -56,30 +57,10 @@ class KnowledgeMixin(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         # SB3 passes raw observations here, and the true last one of an episode.
-        for i, info in enumerate(infos):
-            if RAW_LAST in info:
-                _set_row(next_obs, i, info[RAW_LAST])
-        before, after = (environment_layout(o, self.images) for o in (obs, next_obs))
-        if self.ap_function is not None:
-            labels = query_labels(self.ap_function, "ap_function", before, self._unscale(action), after)
-        elif self.needs_labels or any("permissible" in info for info in infos):
-            labels = labels_from_infos(infos)
-        else:
-            labels = None
-        if labels is not None:
-            self.knowledge.add(obs, action.reshape(len(labels), -1), labels)
-        self.reward_scale.update(reward)
-        if self.shaping:
-            truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
-            terminal = np.asarray(done, dtype=bool) & ~truncated
-            reward = reward + self.shaping.difference(labels, before, after, terminal, float(self.reward_scale))
+        added = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
+        if added is not None:
+            reward = reward + added
         super().add(obs, next_obs, action, reward, done, infos)
-
-    def _unscale(self, action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        if not isinstance(self.action_space, spaces.Box):
-            return action
-        low, high = self.action_space.low, self.action_space.high
-        return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
 
     def __getstate__(self) -> dict[str, Any]:
         # The user's functions belong to the model; the file holds only data.
@@ -117,7 +98,7 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
         before, after = (environment_layout(side, self.images) for side in (obs, next_obs))
         labels = None
         if self.ap_function is not None:
-            actions = self._unscale(raw.actions.cpu().numpy())
+            actions = unscaled(self.action_space, raw.actions.cpu().numpy())
             labels = query_labels(self.ap_function, "ap_function", before, actions, after)
         terminal = raw.dones.cpu().numpy().ravel() > 0
         added = self.shaping.difference(labels, before, after, terminal, float(self.reward_scale)).reshape(-1, 1)
@@ -141,15 +122,6 @@ GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
 def _normalized(buffer: ReplayBuffer, obs: dict[str, Any], env: VecNormalize | None) -> dict[str, Any]:
     normalized: Any = buffer._normalize_obs(obs, env)
     return dict(normalized)
-
-
-def _set_row(observations: Any, row: int, obs: Any) -> None:
-    """Writes one observation into a batch."""
-    if isinstance(observations, dict):
-        for key, batch in observations.items():
-            batch[row] = obs[key]
-    else:
-        observations[row] = obs
 
 
 def guided_buffer_class(

@@ -18,11 +18,13 @@ CONSTANT_LABELS_WARNING = 1_000
 class PermissibilityCallback(BaseCallback):
     """Fits and validates E at the end of each rollout, as often as the model's settings say.
 
+    For an on-policy algorithm, which calls :meth:`refit` itself, after the update that follows the rollout.
+
     A guided model adds one automatically. To change how E is trained, override :meth:`fit` or :meth:`validate` and
     pass an instance to ``learn(callback=...)``: it replaces the default one.
     """
 
-    model: Any  # a guided model, that is a LearnedPermissibilityMixin
+    model: Any  # a guided model, that is a LearnedPredictorMixin
 
     def __init__(self, verbose: int = 0):
         super().__init__(verbose)
@@ -51,14 +53,19 @@ class PermissibilityCallback(BaseCallback):
         new = np.subtract(knowledge.seen, self._seen)
         if new.any():
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
-        due = self.model.refits_due(self._start // self.model.n_envs, self.model.lifetime_steps // self.model.n_envs)
-        due = int(min(due, self.model.fits_per_rollout))
-        if min(knowledge.counts("train")) >= self.model.min_per_class:
-            for _ in range(due):
-                self.fit()
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)
-        if due > 0 and self.model.predictor.fitted and min(knowledge.counts("validation")) > 0:
+        if not getattr(self.model, "fits_after_update", False):
+            n_envs = self.model.n_envs
+            due = self.model.refits_due(self._start // n_envs, self.model.lifetime_steps // n_envs)
+            self.refit(int(min(due, self.model.fits_per_rollout)))
+
+    def refit(self, n: int) -> None:
+        """Fits E ``n`` times, if K holds enough examples, and validates it once."""
+        if min(self.knowledge.counts("train")) >= self.model.min_per_class:
+            for _ in range(n):
+                self.fit()
+        if n > 0 and self.model.predictor.fitted and min(self.knowledge.counts("validation")) > 0:
             self.validate()
 
     def fit(self) -> None:

@@ -28,7 +28,8 @@ SUFFICIENT_ACCURACY = 0.7
 class PermissibilityPredictor(BaseModel):
     """E(s, a | θ_E): the logit that action a is permissible in state s.
 
-    Its inputs are observations as the policy gets them, and actions scaled to [-1, 1], or one-hot if they are discrete.
+    Its inputs are observations as the policy gets them, and actions scaled to [-1, 1], or one-hot if they are discrete
+    (in each dimension of a ``MultiDiscrete``); those of a ``MultiBinary`` are as they are.
 
     :param observation_space: of the environment
     :param action_space: of the environment
@@ -127,8 +128,7 @@ class PermissibilityPredictor(BaseModel):
 
     def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of (n, action_dim) scaled actions; above zero means permissible."""
-        if isinstance(self.action_space, spaces.Discrete):
-            actions = F.one_hot(actions.flatten().long(), int(self.action_space.n))
+        actions = _encoded(self.action_space, actions)
         # A float64 action space brings float64 actions.
         return self.head(th.cat([features, actions.to(features.dtype)], dim=1)).squeeze(1)  # type: ignore[no-any-return]
 
@@ -199,6 +199,16 @@ def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None
         raise ValueError(f"`batch_size` must be a whole number of at least 1, but is {batch_size!r}.")
     if not (isinstance(learning_rate, Real) and float(learning_rate) >= 0):
         raise ValueError(f"`learning_rate` of the predictor must be a number of at least 0, but is {learning_rate!r}.")
+
+
+def _encoded(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:
+    """(n, input_dim) actions as E sees them."""
+    if isinstance(space, spaces.Discrete):
+        return F.one_hot(actions.flatten().long(), int(space.n))
+    if isinstance(space, spaces.MultiDiscrete):
+        columns = zip(actions.long().unbind(dim=1), space.nvec.tolist(), strict=True)
+        return th.cat([F.one_hot(column, n) for column, n in columns], dim=1)
+    return actions
 
 
 def query_candidates(

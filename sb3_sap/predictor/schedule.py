@@ -6,6 +6,9 @@ import math
 from numbers import Real
 from typing import Any
 
+#: Labels that count more than later ones where fits are in proportion to what is new, and how much more.
+EARLY_LABELS, EARLY_WEIGHT = 2_000, 8
+
 
 def due(growth: float, before: int, now: int, every: int = 1, max_gap: float = math.inf) -> int:
     """The number of updates due after the count ``before``, up to ``now``.
@@ -25,6 +28,15 @@ def due(growth: float, before: int, now: int, every: int = 1, max_gap: float = m
         return int(updates + (count - growing) / max_gap) // every
 
     return total(now) - total(before)
+
+
+def weighted_labels(n: int) -> int:
+    """What the first ``n`` labels count for, where fits are in proportion to what is new.
+
+    The first :data:`EARLY_LABELS` count :data:`EARLY_WEIGHT` times: they have to teach E from nothing, and however long
+    the training is, their fits take a second or so.
+    """
+    return n + (EARLY_WEIGHT - 1) * min(n, EARLY_LABELS)
 
 
 def check_growth(model: Any, name: str) -> None:

@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.zoo.configs import evaluation_options
 from sb3_sap.zoo.spaces import (
     convert_crossq_params,
@@ -37,6 +38,9 @@ def register() -> None:
         if issubclass(algorithm, ActionPermissibilityMixin):
             samplers[name] = guided_sampler(samplers[base])
             converters[name] = guided_converter(converters[base])
+    for name, on_policy in ON_POLICY_ALGORITHMS.items():
+        base = next(BASES[cls] for cls in on_policy.__mro__ if cls in BASES)
+        ALGOS[name], samplers[name], converters[name] = on_policy, samplers[base], converters[base]
 
 
 @contextmanager

@@ -1,0 +1,187 @@
+"""The judgement of E about the actions of a policy: masks of finite actions, and the choice of continuous ones."""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.logger import Logger
+
+from sb3_sap.common.arrays import BoolArray, rows_of
+from sb3_sap.common.torch_utils import flush_denormals
+from sb3_sap.guidance.candidates import stratified_candidates
+from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_actions, joint_log_probs
+from sb3_sap.predictor.network import PermissibilityPredictor
+
+#: Maximum number of pairs of a state and an action that E judges at once, which bounds the memory of its layers.
+PAIRS_AT_ONCE = 32_768
+
+
+class Guide:
+    """Restricts a policy's distribution to what E permits; where E permits nothing, to nothing.
+
+    :param predictor: E, which must not change while a rollout is collected and learned from
+    :param space: the action space
+    :param n_candidates: number of draws from a continuous policy, of which the first permissible one is executed
+    :param squashed: whether the policy's actions are scaled to [-1, 1]
+    :param device: of the policy
+    :param predicts: whether ``predict`` is guided, too
+    """
+
+    def __init__(
+        self,
+        predictor: PermissibilityPredictor,
+        space: spaces.Space[Any],
+        n_candidates: int,
+        squashed: bool,
+        device: th.device,
+        predicts: bool = False,
+    ):
+        self.predictor = predictor
+        self.space = space
+        self.n_candidates = n_candidates
+        self.squashed = squashed
+        self.predicts = predicts
+        #: Where rates are recorded; ``None``: nowhere.
+        self.logger: Logger | None = None
+        self._known: dict[bytes, BoolArray] = {}  # masks of states that were judged
+        self.actions = None if isinstance(space, spaces.Box) else joint_actions(space).to(device)
+
+    def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
+        """A policy's distribution, guided.
+
+        :param obs: n observation tensors
+        :param distribution: of the policy in these states
+        :param executed: (n, *action_shape) actions to be evaluated, which were chosen with the same E
+        """
+        if self.actions is None:
+            if executed is not None:
+                return distribution  # see `first_permissible`
+            # The object is the policy's own, and used again.
+            guided = copy.copy(distribution)
+            guided.get_actions = partial(self.first_permissible, obs, distribution)  # type: ignore[method-assign]
+            return guided
+        mask = self.mask(obs)
+        if executed is not None:
+            # Where a state is judged anew, E's verdict at the border may depend on the size of the batch.
+            mask[th.arange(len(mask), device=mask.device), index_of(self.space, executed)] = True
+        if mask.all():
+            return distribution
+        log_probs = joint_log_probs(distribution, self.actions)
+        if executed is None:
+            rejected = log_probs.detach().masked_fill(mask, -th.inf).exp().sum(dim=1)
+            self._record("sap/rejection_rate", rejected.mean().item())
+        return MaskedDistribution(log_probs, mask, self.space, self.actions)
+
+    def mask(self, obs: Any) -> th.Tensor:
+        """(n, k) bool, which of all k actions are permitted in n states.
+
+        E is fixed, and an update sees each state of the rollout several times: each is judged once.
+        """
+        assert self.actions is not None
+        states = _rows_as_bytes(obs)
+        new = [row for row, state in enumerate(states) if state not in self._known]
+        if new:
+            judged = permitted(self.predictor, rows_of(obs, new), self.actions).cpu().numpy()
+            self._known.update(zip((states[row] for row in new), judged, strict=True))
+        return th.as_tensor(np.stack([self._known[state] for state in states]), device=self.actions.device)
+
+    @th.no_grad()
+    @flush_denormals()
+    def first_permissible(self, obs: Any, distribution: Distribution, deterministic: bool = False) -> th.Tensor:
+        """(n, action_dim) the first of ``n_candidates`` draws from a continuous policy that E permits.
+
+        If E permits none, it is the first draw. The first draw is the policy's own; the others are drawn in one call.
+        The executed action has the density π · 1[E > 0] / Z. Its log-probability is taken to be the policy's log π:
+        in each state the expected advantage under the executed density is zero, and so is that of ∇ log Z, which is
+        the same for all actions of the state, so that leaving it out is unbiased to first order. An estimate of Z
+        from a few draws would bring noise instead.
+
+        :param deterministic: the mode, or the candidate nearest to it among stratified ones of a fixed seed
+        """
+        proposed = distribution.get_actions(deterministic=deterministic)
+        features = self.predictor.features(obs)
+        rejected = self.predictor.logits(features, self.scaled(proposed)) <= 0
+        self._record("sap/rejection_rate", rejected.float().mean().item())
+        rows = rejected.nonzero().flatten()
+        if len(rows) == 0 or self.n_candidates == 1:
+            return proposed
+        candidates = self._around(proposed[rows]) if deterministic else self._draws(distribution, rows)  # (m, N, dim)
+        m, n, dim = candidates.shape
+        scaled = self.scaled(candidates.reshape(m * n, dim))
+        verdicts = self.predictor.logits(features[rows].repeat_interleave(n, dim=0), scaled).reshape(m, n) > 0
+        found = verdicts.any(dim=1)
+        self._record("sap/fallback_rate", 1 - found.float().mean().item())
+        first = verdicts.int().argmax(dim=1)
+        guided = proposed.clone()
+        guided[rows[found]] = candidates[found, first[found]]
+        return guided
+
+    def _draws(self, distribution: Any, rows: th.Tensor) -> th.Tensor:
+        """(m, N - 1, action_dim) further draws in the states of ``rows``."""
+        normal = distribution.distribution
+        # gSDE's own noise is the same at every call: this is its distribution over many.
+        own = th.distributions.Normal(normal.mean[rows], normal.stddev[rows])
+        drawn = own.sample(th.Size([self.n_candidates - 1])).transpose(0, 1)  # type: ignore[no-untyped-call]
+        bijector = getattr(distribution, "bijector", None)
+        return drawn if bijector is None else bijector.forward(drawn)  # type: ignore[no-any-return]
+
+    def _around(self, proposed: th.Tensor) -> th.Tensor:
+        """(m, N, action_dim) candidates from the whole space, the nearest to the proposed actions first."""
+        ones = np.ones((1, proposed.shape[1]), np.float32)
+        candidates = th.as_tensor(stratified_candidates(np.random.default_rng(0), -ones, ones, self.n_candidates)[0])
+        candidates = candidates.to(proposed.device)
+        order = th.cdist(self.scaled(proposed), candidates).argsort(dim=1)
+        return candidates[order] if self.squashed else self._unscaled(candidates[order])
+
+    def scaled(self, actions: th.Tensor) -> th.Tensor:
+        """(n, action_dim) what is executed of a policy's continuous actions, scaled to [-1, 1]."""
+        return actions if self.squashed else self.scaled_freely(actions).clamp(-1, 1)
+
+    def scaled_freely(self, actions: th.Tensor) -> th.Tensor:
+        """The same without the clipping to the bounds."""
+        low, high = self._bounds(actions)
+        return 2 * (actions - low) / (high - low) - 1
+
+    def _unscaled(self, actions: th.Tensor) -> th.Tensor:
+        low, high = self._bounds(actions)
+        return low + (actions + 1) / 2 * (high - low)
+
+    def _bounds(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        assert isinstance(self.space, spaces.Box)
+        bounds = (self.space.low.reshape(-1), self.space.high.reshape(-1))
+        low, high = (th.as_tensor(bound, dtype=actions.dtype, device=actions.device) for bound in bounds)
+        return low, high
+
+    def _record(self, name: str, value: float) -> None:
+        if self.logger is not None:
+            self.logger.record_mean(name, value)
+
+
+def _rows_as_bytes(obs: Any) -> list[bytes]:
+    """What tells each of n states from the others."""
+    arrays = [value.cpu().numpy() for value in (obs.values() if isinstance(obs, dict) else [obs])]
+    rows = [[row.tobytes() for row in array] for array in arrays]
+    return [b"".join(parts) for parts in zip(*rows, strict=True)]
+
+
+@th.no_grad()
+@flush_denormals()
+def permitted(predictor: PermissibilityPredictor, obs: Any, actions: th.Tensor) -> th.Tensor:
+    """(n, k) bool, which of k actions E permits in n states; where it permits none, all.
+
+    :param obs: n observation tensors
+    :param actions: (k, action_dim)
+    """
+    features, k = predictor.features(obs), len(actions)
+    verdicts = [
+        predictor.logits(part.repeat_interleave(k, dim=0), actions.repeat(len(part), 1)).reshape(len(part), k) > 0
+        for part in th.split(features, max(1, PAIRS_AT_ONCE // k))
+    ]
+    mask = th.cat(verdicts)
+    return mask | ~mask.any(dim=1, keepdim=True)

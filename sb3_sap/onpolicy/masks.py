@@ -1,0 +1,124 @@
+"""The distribution of a policy over finitely many actions, restricted to those that are permitted."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    Distribution,
+    MultiCategoricalDistribution,
+)
+from torch.distributions import Categorical
+from torch.nn import functional as F
+
+#: Logit of an action that is not permitted, as in sb3-contrib's ``MaskablePPO``: its probability is exactly 0, and
+#: unlike an infinite one it brings no NaN into gradients and Kullback-Leibler divergences.
+REJECTED_LOGIT = -1e8
+
+
+def sizes_of(space: spaces.Space[Any]) -> list[int]:
+    """The number of choices in each dimension of a finite action space."""
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    return (
+        list(space.nvec.tolist())
+        if isinstance(space, spaces.MultiDiscrete)
+        else [2] * int(np.prod(space.shape or (1,)))
+    )
+
+
+def joint_actions(space: spaces.Space[Any]) -> th.Tensor:
+    """(k, action_dim) every action of a finite space, the last dimension fastest."""
+    sizes = sizes_of(space)
+    return th.as_tensor(np.stack(np.unravel_index(np.arange(np.prod(sizes)), sizes), axis=1))
+
+
+def joint_log_probs(distribution: Distribution, actions: th.Tensor) -> th.Tensor:
+    """(n, k) log-probabilities of k joint actions in n states: the dimensions of SB3's policies are independent.
+
+    :param actions: (k, action_dim), those of :func:`joint_actions`
+    :raise TypeError: for a distribution that is none of SB3's over finite actions
+    """
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.distribution.logits
+    if isinstance(distribution, MultiCategoricalDistribution):
+        columns = zip(distribution.distribution, actions.unbind(dim=1), strict=True)
+        return th.stack([one.logits[:, column] for one, column in columns]).sum(dim=0)
+    if isinstance(distribution, BernoulliDistribution):
+        logits, ones = distribution.distribution.logits, actions.to(distribution.distribution.logits.dtype)
+        return F.logsigmoid(logits) @ ones.T + F.logsigmoid(-logits) @ (1 - ones).T
+    raise TypeError(
+        f"The policy's {type(distribution).__name__} cannot be masked: use a policy of SB3's distributions."
+    )
+
+
+class MaskedDistribution(Distribution):
+    """A policy's distribution over joint actions, given that the action is permitted.
+
+    ``Discrete`` gives what sb3-contrib's ``MaskableCategorical`` gives, to the bit. For several dimensions the mask
+    is of combinations, which no product of masked dimensions could express.
+
+    :param log_probs: (n, k) of the policy
+    :param mask: (n, k) bool, with at least one True in each row
+    :param space: the finite action space, of k actions
+    :param actions: (k, action_dim), those of :func:`joint_actions`
+    """
+
+    distribution: Categorical
+
+    def __init__(self, log_probs: th.Tensor, mask: th.Tensor, space: spaces.Space[Any], actions: th.Tensor):
+        super().__init__()  # type: ignore[no-untyped-call]
+        rejected = th.tensor(REJECTED_LOGIT, dtype=log_probs.dtype, device=log_probs.device)
+        self.distribution = Categorical(logits=th.where(mask, log_probs, rejected))
+        self.space = space
+        self.actions = actions
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """(n,) of (n, *action_shape) actions."""
+        return self.distribution.log_prob(index_of(self.space, actions))  # type: ignore[no-any-return, no-untyped-call]
+
+    def entropy(self) -> th.Tensor:
+        """(n,) of the masked distribution."""
+        return self.distribution.entropy()  # type: ignore[no-any-return, no-untyped-call]
+
+    def sample(self) -> th.Tensor:
+        """(n, *action_shape)."""
+        return self._action(self.distribution.sample())  # type: ignore[no-untyped-call]
+
+    def mode(self) -> th.Tensor:
+        """(n, *action_shape), the most probable joint action that is permitted."""
+        return self._action(th.argmax(self.distribution.probs, dim=1))
+
+    def _action(self, index: th.Tensor) -> th.Tensor:
+        if isinstance(self.space, spaces.Discrete):
+            return index
+        actions = self.actions[index]
+        return actions.float() if isinstance(self.space, spaces.MultiBinary) else actions  # as SB3's distributions do
+
+    # What SB3 builds distributions with, which this one is not built with.
+
+    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError
+
+    def proba_distribution(self, *args: Any, **kwargs: Any) -> Self:
+        raise NotImplementedError
+
+    def actions_from_params(self, *args: Any, **kwargs: Any) -> th.Tensor:
+        raise NotImplementedError
+
+    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
+        raise NotImplementedError
+
+
+def index_of(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:
+    """(n,) the rows of :func:`joint_actions` that hold (n, *action_shape) actions."""
+    if isinstance(space, spaces.Discrete):
+        return actions.long().flatten()
+    sizes = sizes_of(space)
+    strides = [int(np.prod(sizes[i + 1 :])) for i in range(len(sizes))]
+    return (actions.long() * th.as_tensor(strides, device=actions.device)).sum(dim=1)

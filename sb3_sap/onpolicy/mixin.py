@@ -1,0 +1,271 @@
+"""What turns an SB3 on-policy algorithm into one that learns and uses permissibility."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar, Self, cast
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_sap.common.errors import check_at_least, is_number
+from sb3_sap.common.extractors import with_extractor
+from sb3_sap.common.saving import SavingMixin
+from sb3_sap.common.schedules import as_schedule
+from sb3_sap.common.signatures import merged_signature
+from sb3_sap.common.spaces import check_any_action_space
+from sb3_sap.common.watching import every_callback
+from sb3_sap.onpolicy.guide import Guide
+from sb3_sap.onpolicy.labels import LabelCallback, shaped_rewards
+from sb3_sap.onpolicy.loss import permissibility_passes
+from sb3_sap.onpolicy.policy import GuidedPolicyMixin, guided_policy_class
+from sb3_sap.predictor.building import make_knowledge
+from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permissibility_callback
+from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.labelling import LabelledTransitions
+from sb3_sap.predictor.learned import LearnedPredictorMixin
+from sb3_sap.predictor.schedule import weighted_labels
+
+#: Maximum number of combinations of a MultiDiscrete or MultiBinary action, each of which E judges in each state.
+MOST_COMBINATIONS = 4_096
+
+
+class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAlgorithm):
+    """Guides an SB3 on-policy algorithm with a learned AP predictor E.
+
+    Goes before the algorithm in the bases of a class. E is fixed while a rollout is collected and learned from; it is
+    fitted afterwards, in proportion to the new labels. While it is accurate, its verdicts restrict the rollout:
+
+    - Finite actions are masked. Log-probabilities and entropy are those of the masked distribution, in the update
+      with the same masks. For ``MultiDiscrete`` and ``MultiBinary`` actions E judges each combination.
+    - Of continuous actions, the first of some draws from the policy that E permits is executed
+      (:meth:`~sb3_sap.onpolicy.guide.Guide.first_permissible`).
+
+    Where E permits nothing everything is permitted. ``predict`` is the policy alone unless ``guided=True`` is passed.
+    The further parameters are those of :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin` and of the base
+    algorithm, whose ``learning_rate`` and ``clip_range`` may also be ``"lin_<number>"``. A recurrent policy has a
+    memory; E sees the observation alone.
+
+    :param alpha: 1: E guides once its balanced validation accuracy is 70 %; 0: never
+    :param n_candidates: number of draws from a policy of continuous actions
+    :param predictor_epochs: how often, on average, fits of E see each labelled action, like ``n_epochs`` of PPO; the
+        first 2,000 count eight times (:func:`~sb3_sap.predictor.schedule.weighted_labels`)
+    :param permissibility_coef: β of a loss towards permissible actions after each update of the policy
+        (:func:`~sb3_sap.onpolicy.loss.permissibility_passes`), a number, a schedule, or ``"lin_1.0_0.5"``, which fades
+        to 0 in the middle of ``learn``: a label that a good policy sometimes violates would bias the end. It is
+        applied while E is accurate, whatever ``alpha``
+    :param permissibility_epochs: passes over the rollout for that loss
+    """
+
+    held: ClassVar[tuple[str, ...]] = ("use_sde",)
+    #: Settings that may be numbers, schedules or ``"lin_<number>"``.
+    schedules: ClassVar[tuple[str, ...]] = ("learning_rate", "clip_range", "permissibility_coef")
+    #: E must not change between a rollout and the update that learns from it.
+    fits_after_update: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        policy: Any,
+        env: Any,
+        *args: Any,
+        alpha: float = 1.0,
+        n_candidates: int = 32,
+        predictor_epochs: float = 5,
+        permissibility_coef: float | Schedule | str = 0.0,
+        permissibility_epochs: int = 4,
+        **kwargs: Any,
+    ):
+        self.alpha = alpha
+        self.n_candidates = n_candidates
+        self.predictor_epochs = predictor_epochs
+        self.permissibility_coef: Any = permissibility_coef
+        self.permissibility_epochs = permissibility_epochs
+        #: Holds K; saved with the model.
+        self.labelled = cast(LabelledTransitions, None)
+        self._rollout_guide: Guide | None = None  # of the rollout in progress, and thus of its update
+        self._labels_seen = 0  # labels that fits of E are due for or were made for
+        self._examples_due = 0.0  # examples that E has yet to see
+        self._label_callback = LabelCallback()
+        self._fit_callback: PermissibilityCallback | None = None
+        kwargs["policy_kwargs"] = with_extractor(kwargs.get("policy_kwargs"))
+        super().__init__(policy, env, *args, **kwargs)
+
+    def __init_subclass__(cls, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        if any(base is OffPolicyAlgorithm for base in cls.__mro__):
+            raise TypeError(
+                f"{cls.__name__} puts {cls.__bases__[0].__name__} before an off-policy algorithm: choose an on-policy "
+                "one, such as PPO, or put ActionPermissibilityMixin before it."
+            )
+        # The constructors pass *args and **kwargs on; editors and API pages should show the whole list.
+        cls.__signature__ = merged_signature(cls)  # type: ignore[attr-defined]
+
+    def _check_action_space(self, space: spaces.Space[Any]) -> None:
+        check_any_action_space(type(self).__name__, space, MOST_COMBINATIONS)
+
+    def _setup_model(self) -> None:
+        self._check_settings()
+        for name in self.schedules:
+            if hasattr(self, name):
+                setattr(self, name, as_schedule(getattr(self, name), name))
+        loaded = self.labelled is not None
+        if not loaded:
+            self._check_knowledge_settings()
+            self.labelled = LabelledTransitions(make_knowledge(self))
+        elif self.knowledge.size != self.knowledge_buffer_size:
+            raise ValueError(
+                f"`knowledge_buffer_size` = {self.knowledge_buffer_size} cannot be changed by `load`, because the file "
+                f"holds a knowledge buffer of {self.knowledge.size}: leave it out, or build a new "
+                f"{type(self).__name__}."
+            )
+        rng = self.knowledge.rng
+        plain = self.policy_class
+        # Files hold the plain class, which SB3 and other code know.
+        self.policy_class = guided_policy_class(cast(type[ActorCriticPolicy], plain))
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_class = plain
+        if loaded:
+            self.knowledge.rng = rng  # SB3 has applied the seed anew
+        self._set_label_source(self.labelled)
+
+    def _check_settings(self) -> None:
+        if isinstance(self.alpha, bool) or self.alpha not in (0, 1):
+            raise ValueError(
+                f"`alpha` is 1 (E guides once it is accurate) or 0 (it never does), because the update must know the "
+                f"masks, but is {self.alpha!r}."
+            )
+        check_at_least(self, n_candidates=1, permissibility_epochs=1)
+        epochs: Any = self.predictor_epochs
+        coef = self.permissibility_coef
+        if not (is_number(epochs) and 0 <= float(epochs) < np.inf):
+            raise ValueError(f"`predictor_epochs` must be a number of at least 0, but is {epochs!r}.")
+        if is_number(coef) and not float(coef) >= 0:
+            raise ValueError(f"`permissibility_coef` must be at least 0, but is {coef!r}.")
+
+    @property
+    def knowledge(self) -> KnowledgeBuffer:
+        """K, which is saved with the model."""
+        return self.labelled.knowledge
+
+    def _holds_knowledge(self) -> bool:
+        return self.labelled is not None
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        super().set_random_seed(seed)
+        if seed is not None and self._holds_knowledge():
+            self.knowledge.seed(seed)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        self._set_label_source(self.labelled)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_label_callback", "_fit_callback", "_rollout_guide"]
+
+    # ---------------------------------------------------------------- learning
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        given = callback if isinstance(callback, (list, BaseCallback)) else ConvertCallback(callback)
+        callbacks: list[BaseCallback] = [] if contains_permissibility_callback(given) else [PermissibilityCallback()]
+        self._label_callback = LabelCallback()
+        callbacks = [*callbacks, *(given if isinstance(given, list) else [given]), self._label_callback]
+        combined = super()._init_callback(cast(Any, callbacks), progress_bar)
+        self._fit_callback = next(one for one in every_callback(combined) if isinstance(one, PermissibilityCallback))
+        return combined
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """SB3's ``learn``."""
+        if self.env is None:
+            raise ValueError("This model has no environment to learn in: load it with one, or call `set_env` first.")
+        self._set_label_source(self.labelled)  # a copied model has lost its AP function
+        name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
+    def collect_rollouts(self, env: VecEnv, callback: BaseCallback, rollout_buffer: Any, n_rollout_steps: int) -> Any:
+        """SB3's ``collect_rollouts``, guided while E is accurate, with the labels' share in the stored rewards."""
+        self._rollout_guide = self._guide() if self.alpha and self._judges else None
+        self.logger.record("sap/alpha", float(self._rollout_guide is not None))
+        with self._guided_by(self._rollout_guide), shaped_rewards(rollout_buffer, self._label_callback):
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+
+    def train(self) -> None:
+        """SB3's ``train`` with the masks of the rollout; then fits of E, and the loss towards permissible actions."""
+        with self._guided_by(self._rollout_guide):
+            super().train()
+        self._refit()
+        coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining)
+        if coef > 0 and self._judges:
+            loss = permissibility_passes(self, self._guide(), coef, self.permissibility_epochs)
+            self.logger.record("sap/permissibility_loss", loss)
+
+    def _refit(self) -> None:
+        """Fits E so often that it sees each new label as often as ``predictor_epochs`` says, on average."""
+        seen = sum(self.knowledge.seen)
+        new = weighted_labels(seen) - weighted_labels(self._labels_seen)
+        due = self._examples_due + self.predictor_epochs * new
+        # While one class is missing the fits remain due, as many as K can make use of.
+        self._examples_due = min(due, self.predictor_epochs * weighted_labels(len(self.knowledge)))
+        self._labels_seen = seen
+        enough = min(self.knowledge.counts("train")) >= self.min_per_class
+        fits = int(self._examples_due // self.dataset_size)
+        if enough and fits > 0 and self._fit_callback is not None:
+            self._examples_due -= fits * self.dataset_size
+            self._fit_callback.refit(fits)
+
+    # ---------------------------------------------------------------- guidance
+
+    @property
+    def _judges(self) -> bool:
+        """Whether E is accurate enough for anything to follow its verdicts."""
+        return self.predictor.fitted and self.predictor_accurate
+
+    def _guide(self, predicts: bool = False) -> Guide:
+        squashed = self.policy.squash_output
+        guide = Guide(self.predictor, self.action_space, self.n_candidates, squashed, self.device, predicts)
+        guide.logger = None if predicts else self.logger
+        return guide
+
+    @contextmanager
+    def _guided_by(self, guide: Guide | None) -> Iterator[None]:
+        """Within the block, the policy is guided; ``None``: it is not."""
+        policy = cast(GuidedPolicyMixin, self.policy)
+        before, policy.guide = policy.guide, guide
+        try:
+            yield
+        finally:
+            policy.guide = before
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[np.ndarray[Any, Any], ...] | None = None,
+        episode_start: np.ndarray[Any, Any] | None = None,
+        deterministic: bool = False,
+        guided: bool = False,
+    ) -> tuple[np.ndarray[Any, Any], tuple[np.ndarray[Any, Any], ...] | None]:
+        """SB3's ``predict``.
+
+        :param guided: restrict the policy to what E permits, as soon as E was fitted; ``alpha`` is ignored
+        """
+        if not (guided and self.predictor.fitted):
+            return super().predict(observation, state, episode_start, deterministic)
+        with self._guided_by(self._guide(predicts=True)):
+            return super().predict(observation, state, episode_start, deterministic)

@@ -1,0 +1,87 @@
+"""A policy of SB3's or sb3-contrib's whose action distribution a guide may restrict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_sap.onpolicy.guide import Guide
+
+
+class GuidedPolicyMixin(ActorCriticPolicy):
+    """Goes before an actor-critic policy. Without a guide, it is that policy to the bit.
+
+    The model sets the guide while it collects a rollout and learns from it, so that copies and files hold none.
+    Every forward pass of SB3's policies makes its distribution with ``_get_action_dist_from_latent``, which does not
+    get the observations: they are kept for that moment.
+    """
+
+    guide: Guide | None = None
+    _pass: tuple[Any, th.Tensor | None] | None = None  # (observations, executed actions) of the pass in progress
+
+    def forward(self, obs: Any, *args: Any, **kwargs: Any) -> Any:
+        return self._guided(super().forward, obs, None, (obs, *args), kwargs)
+
+    def evaluate_actions(self, obs: Any, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
+        return self._guided(super().evaluate_actions, obs, actions, (obs, actions, *args), kwargs)
+
+    def get_distribution(self, obs: Any, *args: Any, **kwargs: Any) -> Any:
+        return self._guided(super().get_distribution, obs, None, (obs, *args), kwargs)
+
+    def _predict(self, *args: Any, **kwargs: Any) -> Any:
+        # An evaluation amid a rollout measures the policy alone.
+        guide = self.guide
+        if guide is not None and not guide.predicts:
+            self.guide = None
+        try:
+            return super()._predict(*args, **kwargs)
+        finally:
+            self.guide = guide
+
+    def _guided(
+        self, method: Callable[..., Any], obs: Any, executed: th.Tensor | None, args: tuple[Any, ...], kwargs: Any
+    ) -> Any:
+        if self.guide is None:
+            return method(*args, **kwargs)
+        self._pass = (obs, executed)
+        try:
+            result = method(*args, **kwargs)
+            if getattr(self, "_pass", None) is not None:  # the method has not made a distribution
+                raise TypeError(
+                    f"The policy {type(self).__name__} does not make its action distribution with SB3's "
+                    "`_get_action_dist_from_latent`, so that it cannot be guided: call that method, or set `alpha=0`."
+                )
+            return result
+        finally:
+            self._pass = None
+
+    def _get_action_dist_from_latent(self, *args: Any, **kwargs: Any) -> Distribution:
+        distribution = super()._get_action_dist_from_latent(*args, **kwargs)
+        if self.guide is None or self._pass is None:
+            return distribution
+        (obs, executed), self._pass = self._pass, None
+        return self.guide.distribution(obs, distribution, executed)
+
+    def __reduce__(self) -> Any:
+        # The class cannot be found by its name, and a copy made amid a rollout is the policy alone.
+        state = {name: value for name, value in vars(self).items() if name not in ("guide", "_pass")}
+        return _new, (type(self).__mro__[2],), state
+
+
+@cache
+def guided_policy_class(plain: type[ActorCriticPolicy]) -> type[GuidedPolicyMixin]:
+    """The guided version of a policy class, under the same name."""
+    if issubclass(plain, GuidedPolicyMixin):
+        return plain
+    names = {"__module__": plain.__module__, "__qualname__": plain.__qualname__, "__doc__": plain.__doc__}
+    return type(plain.__name__, (GuidedPolicyMixin, plain), names)
+
+
+def _new(plain: type[ActorCriticPolicy]) -> GuidedPolicyMixin:
+    cls = guided_policy_class(plain)
+    return cls.__new__(cls)

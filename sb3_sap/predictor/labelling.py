@@ -1,0 +1,106 @@
+"""Labels transitions, fills the knowledge buffer K with them, and says what they add to the rewards."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_sap.common.arrays import BoolArray, FloatArray
+from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
+from sb3_sap.common.vec_envs import RAW_LAST, environment_layout
+from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
+from sb3_sap.predictor.knowledge import KnowledgeBuffer
+
+
+class Labels(Protocol):
+    """What holds K and knows where labels come from: a replay buffer, or a :class:`LabelledTransitions`."""
+
+    knowledge: KnowledgeBuffer
+    ap_function: APFunction | None
+    #: The images that the AP function gets channels last (:func:`~sb3_sap.common.vec_envs.channels_last`).
+    images: tuple[str, ...]
+    #: What is added to the rewards that are learned from; those of the environment, which are logged, stay.
+    shaping: RewardShaping
+    #: Whether a transition without a label is an error; otherwise it is not added to K.
+    needs_labels: bool
+    #: Of the environment's own rewards.
+    reward_scale: RewardScale
+
+
+class LabelledTransitions:
+    """K of an on-policy algorithm, which has no replay buffer to hold it, and where its labels come from.
+
+    It is saved with the model.
+
+    :param knowledge: K
+    """
+
+    def __init__(self, knowledge: KnowledgeBuffer):
+        self.knowledge = knowledge
+        self.ap_function: APFunction | None = None
+        self.images: tuple[str, ...] = ()
+        self.shaping = RewardShaping()
+        self.needs_labels = True
+        self.reward_scale = RewardScale()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The user's functions belong to the model; the file holds only data.
+        return {**vars(self), "ap_function": None, "shaping": RewardShaping()}
+
+
+def take_in(
+    holder: Labels,
+    action_space: spaces.Space[Any],
+    obs: Any,
+    next_obs: Any,
+    action: np.ndarray[Any, Any],
+    reward: np.ndarray[Any, Any],
+    done: np.ndarray[Any, Any],
+    infos: list[dict[str, Any]],
+) -> FloatArray | None:
+    """Labels n executed actions and adds them to K.
+
+    :param obs: raw, (n, *obs_shape)
+    :param next_obs: raw and true, (n, *obs_shape); the last observation of an episode is overwritten by the exact one,
+        if ``infos`` holds it
+    :param action: scaled, (n, *action_shape)
+    :param reward: of the environment, (n,)
+    :param done: (n,) whether the episode ended
+    :return: (n,) what is added to the rewards; ``None``: nothing
+    """
+    for i, info in enumerate(infos):
+        if RAW_LAST in info:
+            set_row(next_obs, i, info[RAW_LAST])
+    before, after = (environment_layout(o, holder.images) for o in (obs, next_obs))
+    labels: BoolArray | None = None
+    if holder.ap_function is not None:
+        labels = query_labels(holder.ap_function, "ap_function", before, unscaled(action_space, action), after)
+    elif holder.needs_labels or any("permissible" in info for info in infos):
+        labels = labels_from_infos(infos)
+    if labels is not None:
+        holder.knowledge.add(obs, action.reshape(len(labels), -1), labels)
+    holder.reward_scale.update(reward)
+    if not holder.shaping:
+        return None
+    truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
+    terminal = np.asarray(done, dtype=bool) & ~truncated
+    return holder.shaping.difference(labels, before, after, terminal, float(holder.reward_scale))
+
+
+def unscaled(action_space: spaces.Space[Any], action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Actions in the environment's units, of a ``Box`` from those scaled to [-1, 1]."""
+    if not isinstance(action_space, spaces.Box):
+        return action
+    low, high = action_space.low, action_space.high
+    return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
+
+
+def set_row(observations: Any, row: int, obs: Any) -> None:
+    """Writes one observation into a batch."""
+    if isinstance(observations, dict):
+        for key, batch in observations.items():
+            batch[row] = obs[key]
+    else:
+        observations[row] = obs

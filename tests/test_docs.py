@@ -23,6 +23,7 @@ import sb3_sap
 from sb3_sap import DDPGAP, envs, plots, zoo
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.cli.main import main, parser
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
 matplotlib.use("agg")
 
@@ -274,8 +275,13 @@ def learns(cls, observation_space, action_space):
     """Whether an algorithm accepts these spaces."""
     policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
     settings = {"constraint": nearby} if cls in CONSTRAINED else {}
+    if cls in ON_POLICY_ALGORITHMS.values():
+        settings |= {"n_steps": 8}
+        policy = policy.replace("Policy", "LstmPolicy") if cls is sb3_sap.RecurrentPPOAP else policy
+    else:
+        settings |= {"buffer_size": 100}
     try:
-        model = cls(policy, Anything(observation_space, action_space), buffer_size=100, device="cpu", **settings)
+        model = cls(policy, Anything(observation_space, action_space), device="cpu", **settings)
     except (AssertionError, ValueError):
         return False
     return model.learn(3).num_timesteps >= 3
@@ -287,7 +293,7 @@ def test_family_page_lists_the_spaces_that_its_algorithms_take(page):
     rows = re.findall(r"^\| `(\w+)` \| ([✓✗]) \| ([✓✗]) \|$", text, re.MULTILINE)
     assert [name for name, _, _ in rows] == list(SPACES)
     for cls in (getattr(sb3_sap, name) for name in re.findall(r"autoclass:: (\w+)", text)):
-        own = SPACES["Discrete" if cls.discrete else "Box"]
+        own = SPACES["Discrete" if getattr(cls, "discrete", False) else "Box"]
         takes = [(name, learns(cls, SPACES["Box"], space), learns(cls, space, own)) for name, space in SPACES.items()]
         assert takes == [(name, action == "✓", observation == "✓") for name, action, observation in rows], cls
 
@@ -301,7 +307,8 @@ def test_family_page_has_the_sections_of_the_pages_of_sb3(page):
 
 def test_every_algorithm_is_on_one_page():
     named = [name for page in FAMILIES for name in re.findall(r"autoclass:: (\w+)", TEXTS[name_of(page)])]
-    assert sorted(named) == sorted(cls.__name__ for cls in ALGORITHMS.values())
+    known = [*ALGORITHMS.values(), *ON_POLICY_ALGORITHMS.values()]
+    assert sorted(named) == sorted(cls.__name__ for cls in known)
 
 
 # ---------------------------------------------------------------- notebooks

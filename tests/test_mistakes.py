@@ -481,7 +481,7 @@ COMMANDS = [
     Row("papper", command("demo --preset papper"), 1, "'papper' is unknown: did you mean 'paper'"),
     Row("track", command("demo --track wheel2"), 1, "got 'wheel2': did you mean 'wheel-2'"),
     Row("broken.xml", command("demo --track broken.xml"), 1, "is not a readable TORCS track file"),
-    Row("COMMAND", command("nothing"), 2, "invalid choice: 'nothing' .choose from 'demo', 'evaluate'"),
+    Row("COMMAND", command("nothing"), 2, "invalid choice: 'nothing' .choose from 'demo', 'compare', 'evaluate'"),
     Row("nothing.zip", command("evaluate nothing.zip"), 1, "There is no model file nothing.zip: give the .zip"),
     Row("text.zip", command("evaluate text.zip"), 1, "is not a whole model file"),
     Row("--tracks", command("evaluate line.zip --tracks"), 2, "argument --tracks: expected at least one argument"),

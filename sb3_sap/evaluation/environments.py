@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
+
+#: How the names of gymnasium-robotics' tasks begin.
+ROBOTICS = ("Adroit", "AntMaze", "Fetch", "FrankaKitchen", "Hand", "PointMaze")
 
 
 def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
@@ -16,8 +20,10 @@ def make_env(env_id: str, **options: Any) -> gym.Env[Any, Any]:
 
 
 def find_environment(env_id: str) -> None:
-    """Imports the libraries that register tasks, as far as they are installed, until ``env_id`` is registered."""
-    for module in ("highway_env", "gymnasium_robotics"):
-        if env_id not in gym.registry:
-            with suppress(ModuleNotFoundError):
-                importlib.import_module(module)
+    """Imports the library that registers an environment's task, if it is installed and ``env_id`` is not registered."""
+    if env_id in gym.registry:
+        return
+    module = "gymnasium_robotics" if env_id.startswith(ROBOTICS) else "highway_env"
+    with suppress(ModuleNotFoundError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # gymnasium-robotics warns of tasks that nobody has asked for
+        importlib.import_module(module)

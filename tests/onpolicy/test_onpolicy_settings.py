@@ -64,9 +64,9 @@ def test_off_policy_algorithm_is_refused():
         type("Mine", (OnPolicyPermissibilityMixin, stable_baselines3.SAC), {})
 
 
-@pytest.mark.parametrize("name", ["default", "penalty", "recommended"])
+@pytest.mark.parametrize("name", ["default", "penalty", "loss"])
 def test_model_is_built_from_each_preset(name):
-    assert preset_names(PPOAP) == ["default", "penalty", "recommended"]
+    assert preset_names(PPOAP) == ["default", "penalty", "loss"]
     model = PPOAP("MlpPolicy", Line(), **preset(name, PPOAP))
     assert model.penalty == ("auto" if name == "penalty" else 0.0)
 

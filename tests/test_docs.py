@@ -123,7 +123,8 @@ def run_shortly(code, name, names, steps=300):
     """Runs code with its training cut short."""
     code, cuts = re.subn(r"\.learn\([\d_]+", f".learn({steps}", code)
     exec(compile(code.replace(", progress_bar=True", ""), name, "exec"), names)
-    assert cuts == 0 or names["model"].num_timesteps == steps
+    # An on-policy algorithm completes its rollout.
+    assert cuts == 0 or names["model"].num_timesteps - steps in range(names["model"].n_steps)
     return cuts
 
 
@@ -167,7 +168,7 @@ COMMANDS = [
     if line.strip().startswith("sb3-sap ")
 ]
 #: Commands that other tests run, or that need the network or hours.
-LONG = ("benchmark", "train", "enjoy", "optimize", "retest", "record-video", "plot", "torcs")
+LONG = ("benchmark", "compare", "train", "enjoy", "optimize", "retest", "record-video", "plot", "torcs")
 
 
 @pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}-{command}" for page, command in COMMANDS])

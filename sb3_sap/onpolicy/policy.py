@@ -7,8 +7,10 @@ from functools import cache
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_sap.onpolicy.guide import Guide
 
@@ -24,10 +26,18 @@ class GuidedPolicyMixin(ActorCriticPolicy):
     guide: Guide | None = None
     _pass: tuple[Any, th.Tensor | None] | None = None  # (observations, executed actions) of the pass in progress
 
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        extractor = super().make_features_extractor()
+        # For MultiDiscrete observations SB3's is NumPy's, which torch's LSTM refuses.
+        extractor._features_dim = int(extractor._features_dim)
+        return extractor
+
     def forward(self, obs: Any, *args: Any, **kwargs: Any) -> Any:
         return self._guided(super().forward, obs, None, (obs, *args), kwargs)
 
     def evaluate_actions(self, obs: Any, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
+        if isinstance(self.action_space, spaces.MultiBinary):
+            actions = actions.float()  # sb3-contrib's recurrent buffer has bytes, which torch refuses
         return self._guided(super().evaluate_actions, obs, actions, (obs, actions, *args), kwargs)
 
     def get_distribution(self, obs: Any, *args: Any, **kwargs: Any) -> Any:

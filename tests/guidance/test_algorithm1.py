@@ -216,7 +216,7 @@ def test_t_k_defaults_to_learning_starts():
 
 
 def test_noise_ends_at_t_k_and_does_not_return_in_a_second_learn():
-    model = build(DDPGAP, learning_starts=10, t_k=20, action_noise=Constant(0.1), alpha=0.0)
+    model = build(DDPGAP, learning_starts=10, t_k=20, action_noise=Constant(0.1), alpha=1e-9)
     predicted = []
     predict = model.predict
     model.predict = lambda *args, **kwargs: predicted.append(model.num_timesteps) or predict(*args, **kwargs)
@@ -232,8 +232,15 @@ def test_noise_ends_at_t_k_and_does_not_return_in_a_second_learn():
     assert model.action_noise.calls == 20
 
 
+def test_without_guidance_noise_goes_on_after_t_k():
+    model = build(DDPGAP, learning_starts=10, t_k=20, action_noise=Constant(0.1), alpha=0.0).learn(30)
+    assert model.action_noise.calls == 30
+    model.learn(5)  # without another uniform warm-up
+    assert model.action_noise.calls == 35
+
+
 def test_t_k_counts_the_steps_of_all_learns():
-    model = build(DDPGAP, learning_starts=0, t_k=20, action_noise=Constant(0.1), alpha=0.0)
+    model = build(DDPGAP, learning_starts=0, t_k=20, action_noise=Constant(0.1), alpha=1e-9)
     for _ in range(2):
         model.learn(8)
     model.learn(8, reset_num_timesteps=False)

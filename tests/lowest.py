@@ -21,8 +21,11 @@ import sb3_sap
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.check.check import check_permissibility
 from sb3_sap.cli.main import main
+from sb3_sap.evaluation import make_env
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.plots import plot_permissibility, return_curves, save
+from sb3_sap.tasks import fetch_reach
 
 ROOT = Path(__file__).resolve().parents[1]
 LANE = "sap/LaneKeeping-v0"
@@ -68,6 +71,24 @@ def algorithms():
     assert not check_permissibility(gym.make("MountainCar-v0"), MOUNTAIN_CAR).advice
 
 
+def on_policy():
+    """Each on-policy algorithm learns, and is saved and loaded."""
+    for name, algorithm in ON_POLICY_ALGORITHMS.items():
+        policy = "MlpLstmPolicy" if "lstm" in name else "MlpPolicy"
+        settings = {"n_steps": 50, "min_per_class": 2, "permissibility_coef": 1.0}
+        algorithm(policy, gym.make(LANE), seed=1, **settings).learn(STEPS).save(name)
+        assert algorithm.load(name).num_timesteps == STEPS
+
+
+def robotics():
+    """A task of gymnasium-robotics can be made and labelled."""
+    env = make_env("FetchReach-v4")
+    before, _ = env.reset(seed=0)
+    after, *_ = env.step(env.action_space.sample())
+    obs, next_obs = ({key: value[None] for key, value in side.items()} for side in (before, after))
+    assert fetch_reach(obs, env.action_space.sample()[None], next_obs).shape == (1,)
+
+
 def commands():
     """The commands that each extra is for, as a user types them."""
     lane = ["--algo", "ddpg_ap", "--env", LANE, "-n", str(STEPS)]
@@ -79,6 +100,18 @@ def commands():
         ["train", *lane, "-P", "--eval-freq", "100", "--eval-episodes", "1"],
         ["plot", "train", "-a", "ddpg_ap", "-e", LANE, "-f", "logs", "-w", "1", "--save-figures", "figures"],
         ["optimize", *lane, *study, "--guidance-only", "--eval-episodes", "1"],
+        [
+            "compare",
+            "MountainCar-v0",
+            "--ap-function",
+            MOUNTAIN_CAR,
+            "--steps",
+            "60",
+            "--seeds",
+            "2",
+            "--episodes",
+            "1",
+        ],
         ["benchmark", "run", *grid, "--configurations", "ddpg_ap:fast", "sbx_sac:default"],
         ["benchmark", "summary", *grid, "--configurations", "ddpg_ap:fast", "sbx_sac:default"],
     ):
@@ -112,7 +145,7 @@ if __name__ == "__main__":
     versions()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        for check in (algorithms, commands, cluster, tools):
+        for check in (algorithms, on_policy, robotics, commands, cluster, tools):
             print(f"\n== {check.__doc__}", flush=True)
             begin = time.monotonic()
             check()

@@ -94,24 +94,14 @@ def commands():
     lane = ["--algo", "ddpg_ap", "--env", LANE, "-n", str(STEPS)]
     grid = ["--simulator", "highway", "--steps", "100", "--seeds", "1", "--tracks", "g-track-3", "--out", "results"]
     study = ["--storage", "study.log", "--study-name", "lowest", "--max-total-trials", "2", "--n-evaluations", "1"]
+    compared = ["--ap-function", MOUNTAIN_CAR, "--steps", "60", "--seeds", "2", "--episodes", "1"]
     for line in (
         ["demo", "--steps", "300"],
         ["push-to-hub", "demo_output", "--repo-id", "me/car", "--dry-run"],
         ["train", *lane, "-P", "--eval-freq", "100", "--eval-episodes", "1"],
         ["plot", "train", "-a", "ddpg_ap", "-e", LANE, "-f", "logs", "-w", "1", "--save-figures", "figures"],
         ["optimize", *lane, *study, "--guidance-only", "--eval-episodes", "1"],
-        [
-            "compare",
-            "MountainCar-v0",
-            "--ap-function",
-            MOUNTAIN_CAR,
-            "--steps",
-            "60",
-            "--seeds",
-            "2",
-            "--episodes",
-            "1",
-        ],
+        ["compare", "MountainCar-v0", *compared],
         ["benchmark", "run", *grid, "--configurations", "ddpg_ap:fast", "sbx_sac:default"],
         ["benchmark", "summary", *grid, "--configurations", "ddpg_ap:fast", "sbx_sac:default"],
     ):

@@ -221,13 +221,18 @@ def test_every_parameter_is_documented():
 
 
 def test_documented_defaults_are_those_of_the_constructor():
-    rows = re.findall(r"^\| `(\w+)` \| `?\"?([\d.,]+|random)\"?`? \|", TEXTS["parameters.md"], re.MULTILINE)
-    assert len(rows) >= 14
-    documented = {name: text if text == "random" else float(text.replace(",", "")) for name, text in rows}
+    before, _, after = TEXTS["parameters.md"].partition("## On-policy algorithms")
+    own, _, presets = after.partition("## Presets")
     # The predictor's learning rate and batch size have the names of the algorithm's.
-    constructors = (DDPGAP, sb3_sap.PermissibilityPredictor)
-    defaults = {name: p.default for cls in constructors for name, p in inspect.signature(cls).parameters.items()}
-    assert documented == {name: defaults[name] for name in documented}
+    for text, least, constructors in (
+        (before + presets, 14, (DDPGAP, sb3_sap.PermissibilityPredictor)),
+        (own, 5, (sb3_sap.PPOAP,)),
+    ):
+        rows = re.findall(r"^\| `(\w+)` \| `?\"?([\d.,]+|random)\"?`? \|", text, re.MULTILINE)
+        assert len(rows) >= least
+        documented = {name: value if value == "random" else float(value.replace(",", "")) for name, value in rows}
+        defaults = {name: p.default for cls in constructors for name, p in inspect.signature(cls).parameters.items()}
+        assert documented == {name: defaults[name] for name in documented}
 
 
 def test_every_logged_metric_is_defined():

@@ -18,7 +18,7 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
     :param ap_function: as the user gave it: a function, its dotted name, or None
     :param potential: the same
     """
-    imports, arguments = ["import gymnasium as gym"], ["seed=0"]
+    imports, arguments, own = ["import gymnasium as gym"], ["seed=0"], job.settings
     if way.name == "base":
         module, _, cls = CLASSES[base_of(job.algo)].partition(":")
         imports.append(f"from {module} import {cls}")
@@ -40,8 +40,11 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
             arguments.append(f"potential={_imported(potential, imports)}")
         names += ["preset"] if "preset(" in way.code else []
         imports.append(f"from sb3_sap import {', '.join(names)}")
-        arguments.append(way.code)
-    arguments += [f"{name}={value!r}" for name, value in job.settings.items()]
+        # A keyword may not be given twice.
+        both = {name: value for name, value in job.settings.items() if name in way.settings}
+        arguments.append(way.code + (f" | {both!r}" if both else ""))
+        own = {name: value for name, value in own.items() if name not in both}
+    arguments += [f"{name}={value!r}" for name, value in own.items()]
     options = "".join(f", {name}={value!r}" for name, value in job.env_kwargs.items())
     maker = f"gym.make({job.env!r}{options})" if isinstance(job.env, str) else f"{job.env.__name__}({options[2:]})"
     return "\n".join(

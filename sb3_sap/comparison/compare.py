@@ -20,10 +20,10 @@ from sb3_sap.algorithms import ALGORITHMS, is_guided
 from sb3_sap.common.errors import is_number, nearest
 from sb3_sap.common.functions import resolve
 from sb3_sap.comparison.code import lines
-from sb3_sap.comparison.decision import Comparison
+from sb3_sap.comparison.decision import Comparison, write_evaluations
 from sb3_sap.comparison.pilot import steps_within
 from sb3_sap.comparison.ways import Way, ways
-from sb3_sap.comparison.worker import Job, policy_for, run_in_process
+from sb3_sap.comparison.worker import Job, policy_for, run_in_process, stop_all
 from sb3_sap.permissibility import does_not_lower
 
 #: Evaluations of a run, at equal distances.
@@ -66,7 +66,8 @@ def compare(
     :param jobs: runs side by side; ``None``: as many as there are processors
     :param settings: arguments of the base algorithm's constructor, such as ``{"learning_rate": 1e-3}``
     :param env_kwargs: arguments of the environment
-    :param out: folder in which table, curves, decision and script are saved; ``None``: nowhere
+    :param out: folder in which evaluations, table, curves, decision and script are saved, the evaluations also if the
+        comparison is interrupted; ``None``: nowhere
     :param console: shows the progress; ``None``: on standard output
     :return: the runs, the decision and the code to paste
     :raise ValueError: for an unknown algorithm, too little time, or a run that fails
@@ -93,11 +94,14 @@ def compare(
         steps = steps_within(minutes, [trial for _, trial in runs], seeds, jobs)
     console.print(f"{len(compared)} ways, {seeds} seeds each, {steps:,} steps, {jobs} side by side")
     numbers = range(first_seed, first_seed + seeds)
-    evaluations = _train(
-        [(way, replace(run, seed=n, steps=steps)) for n in numbers for way, run in runs], jobs, console
-    )
+    rows: list[dict[str, Any]] = []
+    try:
+        _train([(way, replace(run, seed=n, steps=steps)) for n in numbers for way, run in runs], jobs, console, rows)
+    finally:
+        if out is not None:
+            write_evaluations(Path(out), pd.DataFrame(rows))  # also if a run fails, or after Ctrl-C
     code = {way.name: lines(way, replace(job, steps=steps), policy, ap_function, potential) for way in compared}
-    result = Comparison(compared, evaluations, code)
+    result = Comparison(compared, pd.DataFrame(rows), code)
     if out is not None:
         result.save(Path(out))
     return result
@@ -125,8 +129,8 @@ def _labelled(job: Job, way: Way, ap_function: Any, potential: Any) -> Job:
     return replace(job, settings={**labels, **way.settings, **job.settings})
 
 
-def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console) -> pd.DataFrame:
-    """Runs all jobs and returns a row for each evaluation."""
+def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console, rows: list[dict[str, Any]]) -> None:
+    """Runs all jobs, and adds a row for each evaluation to ``rows``."""
     answers: queue.Queue[tuple[Way, Job, dict[str, Any]]] = queue.Queue()
 
     def run(way: Way, job: Job) -> None:
@@ -140,7 +144,6 @@ def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console) -> 
         TimeRemainingColumn(),
         TextColumn("{task.description}"),
     )
-    rows: list[dict[str, Any]] = []
     running = len(jobs)
     with (
         Progress(*columns, console=console, disable=not console.is_terminal) as progress,
@@ -149,20 +152,23 @@ def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console) -> 
         task = progress.add_task("evaluations", total=EVALUATIONS * len(jobs))
         for way, job in jobs:
             pool.submit(run, way, job)
-        while running:
-            way, job, answer = answers.get()
-            if "error" in answer:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise ValueError(f"The run {way.name!r} with seed {job.seed} failed: {answer['error']}")
-            if "seconds" in answer:
-                running -= 1
-                last = _last_return(rows, way, job)
-                console.print(f"{way.name}, seed {job.seed}: mean return {last:.4g} after {job.steps:,} steps")
-                continue
-            del answer["took"]
-            rows.append({"way": way.name, "seed": job.seed, **answer})
-            progress.update(task, advance=1, description=f"{way.name}, seed {job.seed}: {answer['return']:.4g}")
-    return pd.DataFrame(rows)
+        try:
+            while running:
+                way, job, answer = answers.get()
+                if "error" in answer:
+                    raise ValueError(f"The run {way.name!r} with seed {job.seed} failed: {answer['error']}")
+                if "seconds" in answer:
+                    running -= 1
+                    last = _last_return(rows, way, job)
+                    console.print(f"{way.name}, seed {job.seed}: mean return {last:.4g} after {job.steps:,} steps")
+                    continue
+                del answer["took"]
+                rows.append({"way": way.name, "seed": job.seed, **answer})
+                progress.update(task, advance=1, description=f"{way.name}, seed {job.seed}: {answer['return']:.4g}")
+        finally:
+            # Otherwise the pool would wait for the runs in progress, and begin those that wait.
+            pool.shutdown(wait=False, cancel_futures=True)
+            stop_all()
 
 
 def _last_return(rows: list[dict[str, Any]], way: Way, job: Job) -> float:

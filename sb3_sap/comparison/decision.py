@@ -115,15 +115,20 @@ class Comparison:
 
     def save(self, folder: Path) -> None:
         """Writes ``evaluations.csv``, ``table.csv``, ``curves.png``, ``decision.txt`` and ``train.py``."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, table in (("evaluations.csv", self.evaluations), ("table.csv", self.table)):
-            with atomic_path(folder / name) as path:
-                table.to_csv(path, index=False)
+        write_evaluations(folder, self.evaluations)
+        with atomic_path(folder / "table.csv") as path:
+            self.table.to_csv(path, index=False)
         with atomic_path(folder / "curves.png") as path:
             self.figure().savefig(path, format="png", dpi=150)
         for name, text in (("decision.txt", self.decision), ("train.py", self.code)):
             with atomic_path(folder / name) as path:
                 path.write_text(text + "\n", encoding="utf-8")
+
+
+def write_evaluations(folder: Path, evaluations: pd.DataFrame) -> None:
+    """Writes ``evaluations.csv``."""
+    with atomic_path(folder / "evaluations.csv") as path:
+        evaluations.to_csv(path, index=False)
 
 
 def _with_interval(values: FloatArray) -> str:

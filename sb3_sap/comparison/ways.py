@@ -46,5 +46,5 @@ def ways(algo: str, potential: bool) -> list[Way]:
         meaning = "the penalty, and a loss on the learned predictor that fades"
         found.append(Way("loss", meaning, preset("loss", algo), f'**preset("loss", {cls})'))
     guided = {"refit_growth": 0.005, "n_candidates": 32}
-    found.append(Way("guidance", "Algorithm 1 of the paper", guided, "refit_growth=0.005, n_candidates=32"))
+    found.append(Way("guidance", "Algorithm 1 of the paper", guided, f"**{guided!r}"))
     return found

@@ -28,6 +28,7 @@ from sb3_sap.evaluation.environments import make_env
 
 #: Seed of the evaluation episodes, the same in every run.
 EVALUATION_SEED = 10_000
+_running: set[subprocess.Popen[bytes]] = set()
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,7 @@ def run_in_process(job: Job) -> Iterator[dict[str, Any]]:
     assert process.stdin is not None
     assert process.stdout is not None
     assert process.stderr is not None
+    _running.add(process)
     errors: list[bytes] = []
     reader = threading.Thread(target=lambda stream: errors.extend(stream), args=(process.stderr,), daemon=True)
     reader.start()
@@ -123,10 +125,17 @@ def run_in_process(job: Job) -> Iterator[dict[str, Any]]:
         code = process.wait()
     finally:
         process.kill()
+        _running.discard(process)
     reader.join()
     if not finished:
         last = errors[-1].decode(errors="replace").strip() if errors else "it said nothing"
         yield {"error": f"its process ended with exit code {code}: {last}"}
+
+
+def stop_all() -> None:
+    """Kills the child processes of all runs in progress."""
+    for process in list(_running):
+        process.kill()
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from sb3_sap.guidance.auxiliary_loss import mean_action, preference_loss
 from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
 from sb3_sap.guidance.values import q_values
 
-#: Actor updates between two measurements of the spread of Q.
+#: The spread of Q is measured where the number of updates is a multiple of this.
 MEASURED_EVERY = 10
 #: Random actions for each state, over which the spread is measured.
 MEASURED_ACTIONS = 8

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 from toy import Line, towards_centre
@@ -33,14 +34,19 @@ def test_comparison_of_a_class_of_the_user(tmp_path):
     assert "Use " in result.decision
 
 
-def test_run_that_fails_is_named():
+def test_run_that_fails_is_named_and_stops_the_others(tmp_path):
     def broken(obs, actions, next_obs):
+        # The first run fails; the others would go on for minutes.
+        if (tmp_path / "failed").exists():
+            return np.ones(len(actions), dtype=bool)
+        (tmp_path / "failed").touch()
         raise KeyError("speed")
 
     with pytest.raises(
         ValueError, match=r"^The run '\w+' with seed 0 failed: RuntimeError: `ap_function` broken raised"
     ):
-        compare(Line, broken, steps=60, seeds=2, settings=QUICK)
+        compare(Line, broken, steps=100_000, seeds=2, settings={**QUICK, "learning_starts": 99_000}, out=tmp_path)
+    assert (tmp_path / "evaluations.csv").exists()
 
 
 def test_command_prints_decision_and_lines(tmp_path):

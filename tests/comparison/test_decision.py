@@ -82,6 +82,16 @@ def test_code_of_every_way_can_be_run(algo, monkeypatch, tmp_path):
         assert scope["model"].num_timesteps >= 12
 
 
+def test_setting_of_the_user_goes_before_that_of_a_way(monkeypatch):
+    monkeypatch.setattr("gymnasium.make", lambda name: Line())
+    job = Job("Line-v0", {}, "ddpg_ap", {"learning_starts": 5, "batch_size": 4, "refit_growth": 0.125}, 0, 12, 10, 1)
+    for way in ways("ddpg_ap", potential=True)[1:]:
+        scope = {}
+        code = lines(way, job, "MlpPolicy", "toy.towards_centre", "toy.centred")
+        exec(code.replace(", progress_bar=True", ""), scope)
+        assert scope["model"].refit_growth == 0.125
+
+
 def test_code_names_functions_of_a_notebook_without_importing_them():
     def mine(obs, actions, next_obs):
         return towards_centre(obs, actions, next_obs)

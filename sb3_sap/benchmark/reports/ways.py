@@ -27,9 +27,9 @@ PENALTY = "base+penalty"
 #: S on every track from which a lap-driving policy has learned the task.
 GOOD = 0.95
 NOTE = (
-    "All configurations of an algorithm share its base settings and explore alike; those that name a `penalty` alone "
-    "use the label as a reward penalty of so much, or by default of the root mean square of the rewards, and "
-    "`penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as the "
+    "All configurations of an algorithm share its base settings. Those with `penalty` or `loss` explore as the base "
+    "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of the root mean square of the "
+    "rewards, and `penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as the "
     "interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over seeds, in "
     "which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. *Mistakes* "
     "is the share of all training steps that the AP function labels non-permissible, and *in excess* what it exceeds "
@@ -53,13 +53,12 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     rows = [_row(results, scores, name, reference) for name in results.names]
     improvements = improvement(results, scores)
     write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
+    goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
         reference=reference,
         good="linear feedback" if laps else "the configuration that ends best",
         tests="tracks (without Spring, whose long lap is driven at the end only)" if laps else "episodes",
-        goal=f"goal (every lap done with S of at least {GOOD})"
-        if laps
-        else f"goal (a mean return of {_goal(results):g})",
+        goal=f"goal ({goal})",
     )
     parts = [f"![Scores over training steps]({kind}.svg)\n", markdown(pd.DataFrame(rows)), note]
     parts += ["## Probability that a run ends better than one with the penalty\n"]
@@ -95,10 +94,6 @@ def improvement(results: Results, scores: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["configuration", "against", "probability", "low", "high"])
 
 
-def _goal(results: Results) -> float:
-    return target_return(results.simulator)
-
-
 def _at(scores: pd.DataFrame, name: str, share: float) -> FloatArray:
     """Scores of a configuration's runs at the last checkpoint up to a share of the training: (runs, 1)."""
     own = scores[scores["configuration"] == name]
@@ -128,7 +123,7 @@ def _row(results: Results, scores: pd.DataFrame, name: str, reference: float) ->
         row["runs that fail"] = f"{(~all_done.astype(bool)).sum()} of {len(all_done)}"
         reached = steps_to_competence(results.laps[results.laps["configuration"] == name], GOOD)
     else:
-        reached = steps_to_return(own.rename(columns={"score": "return"}), _goal(results))
+        reached = steps_to_return(own.rename(columns={"score": "return"}), target_return(results.simulator))
     median, number = median_reached(reached)
     row["steps until the goal"] = f"{median:,.0f} ({number})" if math.isfinite(median) else f"– ({number})"
     curve = results.curve[results.curve["configuration"] == name]

@@ -10,7 +10,7 @@ from typing import Any
 
 from sb3_sap.comparison.worker import Job, run_in_process
 
-#: Trained steps of a trial, beyond those that the algorithm takes before it learns.
+#: Minimum number of trained steps of a trial, and of a run beyond those that the algorithm takes before it learns.
 TRIED = 200
 #: Seconds to import the libraries and build a model.
 START = 4.0
@@ -44,16 +44,17 @@ def steps_within(minutes: float, trials: list[Job], seeds: int, jobs: int) -> in
 
 def _measure(job: Job, warm_up: int) -> tuple[float, float]:
     """Seconds of a training step and of an evaluation episode."""
-    # Two evaluations: the time between them is that of the steps between them and of the second one.
-    total = warm_up + TRIED
+    # Two evaluations: the time between them is that of the steps between them and of the second one. In all of these
+    # steps the algorithm learns, because the first evaluation comes after the warm-up.
+    half = max(warm_up, TRIED)
     began = time.monotonic()
     moments: list[tuple[float, float]] = []
-    for answer in run_in_process(replace(job, steps=total, evaluations=2, episodes=1)):
+    for answer in run_in_process(replace(job, steps=2 * half, evaluations=2, episodes=1)):
         _check(answer)
         if "took" in answer:
             moments.append((time.monotonic() - began, float(answer["took"])))
     (first, _), (second, evaluation) = moments
-    return max(1e-5, (second - first - evaluation) / (total - total // 2)), evaluation
+    return max(1e-5, (second - first - evaluation) / half), evaluation
 
 
 def _check(answer: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from toy import Line, towards_centre
 from sb3_sap import compare
 from sb3_sap.comparison.code import lines
 from sb3_sap.comparison.decision import Comparison
-from sb3_sap.comparison.pilot import steps_within
+from sb3_sap.comparison.pilot import _measure, steps_within
 from sb3_sap.comparison.ways import ways
 from sb3_sap.comparison.worker import Job
 
@@ -127,3 +127,20 @@ def test_steps_follow_from_the_time(monkeypatch):
     with pytest.raises(ValueError, match=r"^1 minutes suffice for 100 steps of each run, .* give at least 2 minutes"):
         steps_within(1, jobs, seeds=4, jobs=2)
     assert np.isfinite(steps_within(60, jobs, seeds=4, jobs=2))
+
+
+def test_steps_before_learning_do_not_count_as_trained(monkeypatch):
+    """Steps are free until 1,000, and then take 0.01 s each; an episode takes 0.5 s."""
+    now = 0.0
+
+    def run(job):
+        nonlocal now
+        for step in (job.steps // 2, job.steps):
+            now = 5.0 + 0.01 * max(0, step - 1_000) + 0.5 * (1 + (step == job.steps))
+            yield {"step": step, "took": 0.5}
+
+    monkeypatch.setattr("sb3_sap.comparison.pilot.run_in_process", run)
+    monkeypatch.setattr("sb3_sap.comparison.pilot.time.monotonic", lambda: now)
+    per_step, episode = _measure(Job("x", {}, "sac_ap", {}, 0, 0, 10, 5), 1_000)
+    assert per_step == pytest.approx(0.01)
+    assert episode == 0.5

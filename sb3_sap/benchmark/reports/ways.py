@@ -29,12 +29,12 @@ GOOD = 0.95
 NOTE = (
     "All configurations of an algorithm share its base settings. Those with `penalty` or `loss` explore as the base "
     "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of the root mean square of the "
-    "rewards, and `penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as the "
-    "interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over seeds, in "
-    "which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. *Mistakes* "
-    "is the share of all training steps that the AP function labels non-permissible, and *in excess* what it exceeds "
-    "the share of a good policy by, which is {reference:.1%} ({good}). Milliseconds per step are "
-    "processor time.\n"
+    "rewards, and `penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as "
+    "the interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over "
+    "seeds, in which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. "
+    "*Mistakes* is the share of all training steps that the AP function labels non-permissible, and *in excess* what "
+    "it exceeds the share of a good policy by, which is {reference:.1%} ({good}). Milliseconds per step are processor "
+    "time.\n"
 )
 
 

@@ -16,9 +16,10 @@ from sb3_sap.algorithms import (
 )
 from sb3_sap.check.check import check_permissibility
 from sb3_sap.check.report import PermissibilityReport
-from sb3_sap.common.extractors import RescaleExtractor
+from sb3_sap.common.extractors import RescaleExtractor, WithoutMaskExtractor
 from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
+from sb3_sap.guidance.mask_wrapper import ActionMaskObservation
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
 from sb3_sap.guidance.wrapper import LearnedPermissibility
 from sb3_sap.onpolicy.algorithms import A2CAP, PPOAP, TRPOAP, RecurrentPPOAP
@@ -62,6 +63,7 @@ __all__ = [
     "TD3AP",
     "TQCAP",
     "TRPOAP",
+    "ActionMaskObservation",
     "ActionPermissibility",
     "ActionPermissibilityMixin",
     "ConstrainedExplorationMixin",
@@ -81,6 +83,7 @@ __all__ = [
     "PermissibilityReport",
     "RecurrentPPOAP",
     "RescaleExtractor",
+    "WithoutMaskExtractor",
     "check_permissibility",
     "compare",
     "does_not_lower",

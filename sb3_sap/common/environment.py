@@ -12,7 +12,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_sap.common.spaces import check_action_space, check_observation_space
-from sb3_sap.common.vec_envs import channels_last, check_wrappers, environment_layout
+from sb3_sap.common.vec_envs import (
+    channels_last,
+    check_wrappers,
+    environment_layout,
+    policy_layout,
+    unnormalized,
+)
 
 
 class EnvironmentMixin(BaseAlgorithm):
@@ -72,3 +78,13 @@ class EnvironmentMixin(BaseAlgorithm):
         """
         raw = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         return environment_layout(raw, self.images)
+
+    def raw_observations(self, observation: Any) -> Any:
+        """(n, *obs_shape) observations as the user's functions get them, of one or a batch as ``predict`` takes it."""
+        if observation is self._last_obs:
+            return self.raw_last_obs()  # exact, whereas rounded and clipped ones cannot be recovered
+        raw = policy_layout(observation, self.observation_space)
+        if not self.policy.is_vectorized_observation(observation):
+            raw = {key: value[None] for key, value in raw.items()} if isinstance(raw, dict) else raw[None]
+        env = self.get_vec_normalize_env()
+        return environment_layout(raw if env is None else unnormalized(env, raw, self.observation_space), self.images)

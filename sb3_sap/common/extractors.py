@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 
 from sb3_sap.common.functions import resolve
 
@@ -46,6 +46,26 @@ class RescaleExtractor(FlattenExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return super().forward((observations - self.shift) / self.scale)
+
+
+class WithoutMaskExtractor(CombinedExtractor):
+    """SB3's extractor of ``Dict`` observations, which leaves the action mask out.
+
+    What a mask forbids is known before a network is asked, and a mask of a thousand actions is a thousand inputs.
+
+    :param observation_space: a ``Dict`` with that entry and others
+    :param key: of the mask, as in :class:`~sb3_sap.guidance.mask_wrapper.ActionMaskObservation`
+    :param kwargs: of SB3's ``CombinedExtractor``
+    """
+
+    def __init__(self, observation_space: spaces.Dict, key: str = "action_mask", **kwargs: Any):
+        entries = dict(observation_space.spaces)
+        if entries.pop(key, None) is None or not entries:
+            raise ValueError(
+                f"WithoutMaskExtractor leaves out {key!r}, but the observation space is {observation_space}: wrap the "
+                "environment in `ActionMaskObservation`, or name the mask in `features_extractor_kwargs`."
+            )
+        super().__init__(spaces.Dict(entries), **kwargs)
 
 
 def with_extractor(policy_kwargs: Any) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def check_any_action_space(algorithm: str, space: spaces.Space[Any], most: int) 
             f"{algorithm} needs actions that count from 0, as SB3's algorithms do, but this `env` has {space}: add "
             "`start` in gymnasium.wrappers.TransformAction."
         )
-    combinations = number_of_combinations(space)
+    combinations = math.prod(sizes_of(space))
     if combinations > most:
         raise ValueError(
             f"{algorithm} judges every combination of actions, of which there may be at most {most:,}, but {space} has "
@@ -67,10 +67,18 @@ def check_any_action_space(algorithm: str, space: spaces.Space[Any], most: int) 
         )
 
 
-def number_of_combinations(space: spaces.MultiDiscrete | spaces.MultiBinary) -> int:
-    """The number of joint actions of a finite space of several dimensions."""
-    sizes = space.nvec.tolist() if isinstance(space, spaces.MultiDiscrete) else [2] * space.shape[0]
-    return math.prod(sizes)
+def sizes_of(space: spaces.Space[Any]) -> list[int]:
+    """The number of choices in each dimension of a finite action space."""
+    if isinstance(space, spaces.Discrete):
+        return [int(space.n)]
+    return list(space.nvec.tolist()) if isinstance(space, spaces.MultiDiscrete) else [2] * math.prod(space.shape or ())
+
+
+def joint_actions(space: spaces.Space[Any]) -> np.ndarray[Any, Any]:
+    """(k, *action_shape) every action of a finite space, the last dimension fastest."""
+    sizes = sizes_of(space)
+    actions = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes), axis=1)
+    return actions.reshape(-1, *(space.shape or ())).astype(space.dtype)
 
 
 def _hint(space: spaces.Space[Any]) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 import torch as th
 
 from sb3_sap.common.torch_utils import flush_denormals
-from sb3_sap.common.vec_envs import environment_layout, policy_layout, unnormalized
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
 from sb3_sap.guidance.candidates import candidate_actions, choose
+from sb3_sap.guidance.masks import check_statistics
 from sb3_sap.predictor.network import query_candidates
 
 
@@ -46,18 +46,10 @@ def guided_prediction(
     :param observation: one, or a batch, as ``predict`` takes it
     :param actions: what the policy proposes, in the environment's units
     """
-    obs, is_batch = model.policy.obs_to_tensor(observation)
+    obs, _ = model.policy.obs_to_tensor(observation)
     shape = cast(Any, model.action_space).shape
-    env = model.get_vec_normalize_env()
-    if env is None and model.learned_normalised and model.permissible_actions is not None:
-        raise ValueError(
-            "`permissible_actions` judges observations as the environment gives them, but this model takes normalised "
-            "ones and has no statistics to undo that: load it with its VecNormalize, `load(path, env=...)`."
-        )
-    raw = policy_layout(observation, model.observation_space)
-    if not is_batch:
-        raw = {key: value[None] for key, value in raw.items()} if isinstance(raw, dict) else raw[None]
-    raw = environment_layout(raw if env is None else unnormalized(env, raw, model.observation_space), model.images)
+    check_statistics(model, model._permissible_actions)
+    raw = model.raw_observations(observation)
     proposed = np.asarray(actions).reshape(-1, *shape)
     if not model.discrete:
         proposed = model.policy.scale_action(proposed)

@@ -15,20 +15,22 @@ from sb3_sap.common.arrays import BoolArray, FloatArray, rows_of
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.random import make_rng
-from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.guidance.candidates import candidate_actions, choose
 from sb3_sap.guidance.constraints import ActionConstraint, query_constraint
-from sb3_sap.guidance.masks import PermissibleActions
+from sb3_sap.guidance.masked_values import MaskedValuesMixin
+from sb3_sap.guidance.masks import PermissibleActions, mask_source
 from sb3_sap.permissibility import query_labels
 
 
-class ConstrainedExplorationMixin(SettingsMixin):
+class ConstrainedExplorationMixin(MaskedValuesMixin):
     """While training, replaces forbidden actions by uniform draws from the allowed ones.
 
     :param constraint: an :class:`~sb3_sap.guidance.constraints.ActionConstraint` or its dotted name, applied from the
         second step of each episode (section 5.1, DDPG-CE1 and -CE2)
-    :param permissible_actions: a :class:`~sb3_sap.guidance.masks.PermissibleActions` or its dotted name, applied at
-        every step. Where it allows none of the candidates, the action is left as it is
+    :param permissible_actions: a :class:`~sb3_sap.guidance.masks.PermissibleActions` or its dotted name, or the key of
+        a mask in a ``Dict`` observation (:class:`~sb3_sap.guidance.mask_wrapper.ActionMaskObservation`), applied at
+        every step. Where it allows none of the candidates, the action is left as it is. For discrete actions the
+        greedy choice, ``predict`` and the target's maximum are over the allowed actions, too
     :param n_candidates: N of Algorithm 1, line 8, the size of A_st; for discrete actions A_st is every action
     """
 
@@ -51,10 +53,8 @@ class ConstrainedExplorationMixin(SettingsMixin):
     def _setup_model(self) -> None:
         saved_rng = self.exploration_rng
         check_at_least(self, n_candidates=1)
-        self._constraint, self._permissible_actions = (
-            None if function is None else resolve(function, name)
-            for name, function in (("constraint", self.constraint), ("permissible_actions", self.permissible_actions))
-        )
+        self._constraint = None if self.constraint is None else resolve(self.constraint, "constraint")
+        self._permissible_actions = mask_source(self.permissible_actions, self.observation_space, self.action_space)
         if self._constraint is not None and isinstance(self.action_space, spaces.Discrete):
             raise ValueError(
                 "`constraint` is an interval of continuous actions, but this action space is "

@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_sap.common.arrays import BoolArray
 from sb3_sap.common.errors import check_at_least, is_number
 from sb3_sap.common.random import make_rng
 from sb3_sap.common.spaces import check_action_space, check_observation_space
@@ -30,9 +31,10 @@ class LearnedPermissibility(ActionPermissibility):
     ``"executed_action"``, in the environment's units; and ``"replaced"``.
 
     Limits: the agent stores the action that it proposed, not the one that was executed, so that it learns what
-    proposing leads to; the penalty for a replaced action tells it to propose others. The loss on E, the masks and the
-    saving of the guided algorithms are not available. Each environment has an E of its own. During evaluation use the
-    environment without this wrapper, or one with ``alpha=0``.
+    proposing leads to; the penalty for a replaced action tells it to propose others. The loss on E and the saving of
+    the guided algorithms are not available; :meth:`action_masks` gives E's verdicts to sb3-contrib's ``MaskablePPO``.
+    Each environment has an E of its own. During evaluation use the environment without this wrapper, or one with
+    ``alpha=0``.
 
     :param env: one environment, not a vector of them, with a bounded ``Box`` or a ``Discrete`` action space
     :param permissible: f(s, a | s') of one step, or ``None``, as for the base class
@@ -111,6 +113,28 @@ class LearnedPermissibility(ActionPermissibility):
             return action
         distance = np.linalg.norm(candidates - own[:, None], axis=2)
         return self._unscaled(choose(self._rng, candidates, permitted, -distance)[0])
+
+    @th.no_grad()
+    @flush_denormals()
+    def action_masks(self) -> BoolArray:
+        """(n,) which of n discrete actions are permissible now, for sb3-contrib's ``MaskablePPO``.
+
+        They are those that E permits, and that the environment's own ``action_masks()`` allows if it has that method.
+        Where E permits none of these, and until its balanced validation accuracy is 70 %, all of these are. With masks
+        for the agent choose ``alpha=0``, or E's verdicts are applied twice.
+        """
+        if not self._discrete:
+            raise TypeError(f"A mask lists finitely many actions, but the action space is {self.action_space}.")
+        n = int(cast(spaces.Discrete, self.action_space).n)
+        allowed = np.ones(n, dtype=bool)
+        if self.env.has_wrapper_attr("action_masks"):
+            allowed = np.asarray(self.env.get_wrapper_attr("action_masks")(), dtype=bool)
+        if not self.validation_accuracy >= SUFFICIENT_ACCURACY:
+            return allowed
+        features = self.predictor.features(obs_as_tensor(_batch(self._obs), th.device("cpu")))
+        every = np.arange(n, dtype=np.float32).reshape(1, n, 1)
+        permitted = allowed & (query_candidates(self.predictor, features, every)[0] > 0)
+        return permitted if permitted.any() else allowed
 
     def _learn(self) -> None:
         self._steps += 1

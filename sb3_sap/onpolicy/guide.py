@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,9 +14,10 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.logger import Logger
 
 from sb3_sap.common.arrays import BoolArray, rows_of
+from sb3_sap.common.spaces import joint_actions
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.candidates import stratified_candidates
-from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_actions, joint_log_probs
+from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_log_probs
 from sb3_sap.predictor.network import PermissibilityPredictor
 
 #: Maximum number of pairs of a state and an action that E judges at once, which bounds the memory of its layers.
@@ -23,9 +25,11 @@ PAIRS_AT_ONCE = 32_768
 
 
 class Guide:
-    """Restricts a policy's distribution to what E permits; where E permits nothing, to nothing.
+    """Restricts a policy's distribution to what E and the known masks permit.
 
-    :param predictor: E, which must not change while a rollout is collected and learned from
+    Where E permits none of the actions that are known to be permissible, all of those are.
+
+    :param predictor: E, which must not change while a rollout is collected and learned from; ``None``: masks alone
     :param space: the action space
     :param n_candidates: number of draws from a continuous policy, of which the first permissible one is executed
     :param squashed: whether the policy's actions are scaled to [-1, 1]
@@ -35,7 +39,7 @@ class Guide:
 
     def __init__(
         self,
-        predictor: PermissibilityPredictor,
+        predictor: PermissibilityPredictor | None,
         space: spaces.Space[Any],
         n_candidates: int,
         squashed: bool,
@@ -49,8 +53,16 @@ class Guide:
         self.predicts = predicts
         #: Where rates are recorded; ``None``: nowhere.
         self.logger: Logger | None = None
-        self._known: dict[bytes, BoolArray] = {}  # masks of states that were judged
-        self.actions = None if isinstance(space, spaces.Box) else joint_actions(space).to(device)
+        #: The known masks of the states in which actions are chosen, (n, k); ``None``: there are none, or the update
+        #: evaluates actions that were chosen before.
+        self.known_masks: Callable[[], BoolArray] | None = None
+        self._judged: dict[bytes, BoolArray] = {}  # E's verdicts on all actions of a state
+        #: The known masks of the rollout's states.
+        self.known: dict[bytes, BoolArray] = {}
+        self.actions: th.Tensor | None = None
+        if not isinstance(space, spaces.Box):
+            actions = joint_actions(space)
+            self.actions = th.as_tensor(actions.reshape(len(actions), -1).astype(np.int64), device=device)
 
     def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
         """A policy's distribution, guided.
@@ -79,17 +91,48 @@ class Guide:
         return MaskedDistribution(log_probs, mask, self.space, self.actions)
 
     def mask(self, obs: Any) -> th.Tensor:
-        """(n, k) bool, which of all k actions are permitted in n states.
-
-        E is fixed, and an update sees each state of the rollout several times: each is judged once.
-        """
+        """(n, k) bool, which of all k actions are permitted in n states."""
         assert self.actions is not None
         states = _rows_as_bytes(obs)
-        new = [row for row, state in enumerate(states) if state not in self._known]
+        known = self._known_of(states)
+        if self.predictor is None:
+            mask = np.ones((len(states), len(self.actions)), dtype=bool) if known is None else known
+        else:
+            mask = self._verdicts(obs, states)
+            if known is not None:
+                both = mask & known
+                mask = np.where(both.any(axis=1, keepdims=True), both, known)
+        return th.as_tensor(mask, device=self.actions.device)
+
+    def _verdicts(self, obs: Any, states: list[bytes]) -> BoolArray:
+        """E's masks. E is fixed, and an update sees each state of the rollout several times: each is judged once."""
+        assert self.actions is not None
+        assert self.predictor is not None
+        new = [row for row, state in enumerate(states) if state not in self._judged]
         if new:
             judged = permitted(self.predictor, rows_of(obs, new), self.actions).cpu().numpy()
-            self._known.update(zip((states[row] for row in new), judged, strict=True))
-        return th.as_tensor(np.stack([self._known[state] for state in states]), device=self.actions.device)
+            self._judged.update(zip((states[row] for row in new), judged, strict=True))
+        return np.stack([self._judged[state] for state in states])
+
+    def _known_of(self, states: list[bytes]) -> BoolArray | None:
+        """The known masks, (n, k): those of now, or in an update those of the rollout."""
+        if self.known_masks is not None:
+            masks = self.known_masks()
+            for state, mask in zip(states, masks, strict=True):
+                # What VecNormalize clips may look the same to the policy and have another mask.
+                self.known[state] = mask | self.known.get(state, mask)
+            return masks
+        if not self.known:
+            return None
+        assert self.actions is not None
+        anything = np.ones(len(self.actions), dtype=bool)
+        unknown = [state for state in states if state not in self.known]
+        if any(state.strip(b"\0") for state in unknown):  # zeros pad the sequences of recurrent policies
+            raise RuntimeError(
+                "The update evaluates an observation in which no action was chosen, so that its mask is not known: "
+                "`permissible_actions` cannot be used with a rollout buffer that changes observations."
+            )
+        return np.stack([self.known.get(state, anything) for state in states])
 
     @th.no_grad()
     @flush_denormals()
@@ -104,6 +147,7 @@ class Guide:
 
         :param deterministic: the mode, or the candidate nearest to it among stratified ones of a fixed seed
         """
+        assert self.predictor is not None
         proposed = distribution.get_actions(deterministic=deterministic)
         features = self.predictor.features(obs)
         rejected = self.predictor.logits(features, self.scaled(proposed)) <= 0
@@ -164,8 +208,9 @@ class Guide:
 
 
 def _rows_as_bytes(obs: Any) -> list[bytes]:
-    """What tells each of n states from the others."""
-    arrays = [value.cpu().numpy() for value in (obs.values() if isinstance(obs, dict) else [obs])]
+    """What tells each of n states from the others, for the policy, whose networks have single precision."""
+    tensors = obs.values() if isinstance(obs, dict) else [obs]
+    arrays = [(value.float() if value.is_floating_point() else value).cpu().numpy() for value in tensors]
     rows = [[row.tobytes() for row in array] for array in arrays]
     return [b"".join(parts) for parts in zip(*rows, strict=True)]
 

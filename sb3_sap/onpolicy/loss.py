@@ -59,6 +59,7 @@ def losses(guide: Guide, obs: Any, distribution: Distribution) -> th.Tensor:
     :param distribution: of the policy alone in these states
     """
     if guide.actions is None:
+        assert guide.predictor is not None
         mode = distribution.mode()
         # A mode outside the bounds is executed at the bound, where E judges it; the gradient may lead it back.
         clipped = guide.scaled(mode)

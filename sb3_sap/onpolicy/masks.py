@@ -16,32 +16,17 @@ from stable_baselines3.common.distributions import (
 from torch.distributions import Categorical
 from torch.nn import functional as F
 
+from sb3_sap.common.spaces import sizes_of
+
 #: Logit of an action that is not permitted, as in sb3-contrib's ``MaskablePPO``: its probability is exactly 0, and
 #: unlike an infinite one it brings no NaN into gradients and Kullback-Leibler divergences.
 REJECTED_LOGIT = -1e8
 
 
-def sizes_of(space: spaces.Space[Any]) -> list[int]:
-    """The number of choices in each dimension of a finite action space."""
-    if isinstance(space, spaces.Discrete):
-        return [int(space.n)]
-    return (
-        list(space.nvec.tolist())
-        if isinstance(space, spaces.MultiDiscrete)
-        else [2] * int(np.prod(space.shape or (1,)))
-    )
-
-
-def joint_actions(space: spaces.Space[Any]) -> th.Tensor:
-    """(k, action_dim) every action of a finite space, the last dimension fastest."""
-    sizes = sizes_of(space)
-    return th.as_tensor(np.stack(np.unravel_index(np.arange(np.prod(sizes)), sizes), axis=1))
-
-
 def joint_log_probs(distribution: Distribution, actions: th.Tensor) -> th.Tensor:
     """(n, k) log-probabilities of k joint actions in n states: the dimensions of SB3's policies are independent.
 
-    :param actions: (k, action_dim), those of :func:`joint_actions`
+    :param actions: (k, action_dim), those of :func:`~sb3_sap.common.spaces.joint_actions`
     :raise TypeError: for a distribution that is none of SB3's over finite actions
     """
     if isinstance(distribution, CategoricalDistribution):
@@ -66,7 +51,7 @@ class MaskedDistribution(Distribution):
     :param log_probs: (n, k) of the policy
     :param mask: (n, k) bool, with at least one True in each row
     :param space: the finite action space, of k actions
-    :param actions: (k, action_dim), those of :func:`joint_actions`
+    :param actions: (k, action_dim), those of :func:`~sb3_sap.common.spaces.joint_actions`
     """
 
     distribution: Categorical
@@ -116,7 +101,7 @@ class MaskedDistribution(Distribution):
 
 
 def index_of(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:
-    """(n,) the rows of :func:`joint_actions` that hold (n, *action_shape) actions."""
+    """(n,) the rows of :func:`~sb3_sap.common.spaces.joint_actions` that hold (n, *action_shape) actions."""
     if isinstance(space, spaces.Discrete):
         return actions.long().flatten()
     sizes = sizes_of(space)

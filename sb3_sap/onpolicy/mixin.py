@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_sap.common.arrays import BoolArray
 from sb3_sap.common.errors import check_at_least, is_number
 from sb3_sap.common.extractors import with_extractor
 from sb3_sap.common.saving import SavingMixin
@@ -23,6 +24,7 @@ from sb3_sap.common.schedules import as_schedule
 from sb3_sap.common.signatures import merged_signature
 from sb3_sap.common.spaces import check_any_action_space
 from sb3_sap.common.watching import every_callback
+from sb3_sap.guidance.masks import PermissibleActions, mask_source, masks_at, masks_of
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.labels import LabelCallback, shaped_rewards
 from sb3_sap.onpolicy.loss import permissibility_passes
@@ -63,8 +65,18 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         to 0 in the middle of ``learn``: a label that a good policy sometimes violates would bias the end. It is
         applied while E is accurate, whatever ``alpha``
     :param permissibility_epochs: passes over the rollout for that loss
+    :param permissible_actions: for finite actions, a :class:`~sb3_sap.guidance.masks.PermissibleActions` or its dotted
+        name, or the key of a mask in a ``Dict`` observation
+        (:class:`~sb3_sap.guidance.mask_wrapper.ActionMaskObservation`). What it does not allow has probability 0, in
+        the rollout, the update and ``predict``; where it allows nothing, everything is. Labels are then optional
     """
 
+    _of_this_process: ClassVar[tuple[str, ...]] = (
+        "_label_callback",
+        "_fit_callback",
+        "_rollout_guide",
+        "_permissible_actions",
+    )
     held: ClassVar[tuple[str, ...]] = ("use_sde",)
     #: Settings that may be numbers, schedules or ``"lin_<number>"``.
     schedules: ClassVar[tuple[str, ...]] = ("learning_rate", "clip_range", "permissibility_coef")
@@ -81,6 +93,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         predictor_epochs: float = 5,
         permissibility_coef: float | Schedule | str = 0.0,
         permissibility_epochs: int = 4,
+        permissible_actions: PermissibleActions | str | None = None,
         **kwargs: Any,
     ):
         self.alpha = alpha
@@ -88,6 +101,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         self.predictor_epochs = predictor_epochs
         self.permissibility_coef: Any = permissibility_coef
         self.permissibility_epochs = permissibility_epochs
+        self.permissible_actions = permissible_actions
         #: Holds K; saved with the model.
         self.labelled = cast(LabelledTransitions, None)
         self._rollout_guide: Guide | None = None  # of the rollout in progress, and thus of its update
@@ -113,6 +127,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
 
     def _setup_model(self) -> None:
         self._check_settings()
+        self._permissible_actions = mask_source(self.permissible_actions, self.observation_space, self.action_space)
         for name in self.schedules:
             if hasattr(self, name):
                 setattr(self, name, as_schedule(getattr(self, name), name))
@@ -145,6 +160,11 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
                 f"masks, but is {self.alpha!r}."
             )
         check_at_least(self, n_candidates=1, permissibility_epochs=1)
+        if self.permissible_actions is not None and isinstance(self.action_space, spaces.Box):
+            raise ValueError(
+                f"`permissible_actions` of an on-policy algorithm masks finite actions, but the action space is "
+                f"{self.action_space}: choose an off-policy algorithm, such as SACAP, or let the environment clip."
+            )
         epochs: Any = self.predictor_epochs
         coef = self.permissibility_coef
         if not (is_number(epochs) and 0 <= float(epochs) < np.inf):
@@ -170,7 +190,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         self._set_label_source(self.labelled)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_label_callback", "_fit_callback", "_rollout_guide"]
+        return [*super()._excluded_save_params(), *self._of_this_process]
 
     # ---------------------------------------------------------------- learning
 
@@ -201,10 +221,20 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, rollout_buffer: Any, n_rollout_steps: int) -> Any:
         """SB3's ``collect_rollouts``, guided while E is accurate, with the labels' share in the stored rewards."""
-        self._rollout_guide = self._guide() if self.alpha and self._judges else None
-        self.logger.record("sap/alpha", float(self._rollout_guide is not None))
-        with self._guided_by(self._rollout_guide), shaped_rewards(rollout_buffer, self._label_callback):
-            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        asks = bool(self.alpha) and self._judges
+        guide = self._rollout_guide = self._guide(asks) if asks or self._permissible_actions is not None else None
+        self.logger.record("sap/alpha", float(asks))
+        with self._guided_by(guide), shaped_rewards(rollout_buffer, self._label_callback):
+            if guide is not None and self._permissible_actions is not None:
+                guide.known_masks = self._masks_of_last_observations
+            try:
+                return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+            finally:
+                if guide is not None:
+                    guide.known_masks = None
+
+    def _masks_of_last_observations(self) -> BoolArray:
+        return masks_of(cast(PermissibleActions, self._permissible_actions), self.action_space, self.raw_last_obs())
 
     def train(self) -> None:
         """SB3's ``train`` with the masks of the rollout; then fits of E, and the loss towards permissible actions."""
@@ -213,7 +243,10 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         self._refit()
         coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining)
         if coef > 0 and self._judges:
-            loss = permissibility_passes(self, self._guide(), coef, self.permissibility_epochs)
+            guide = self._guide(asks=True)
+            if self._rollout_guide is not None:
+                guide.known = self._rollout_guide.known
+            loss = permissibility_passes(self, guide, coef, self.permissibility_epochs)
             self.logger.record("sap/permissibility_loss", loss)
 
     def _refit(self) -> None:
@@ -237,9 +270,11 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         """Whether E is accurate enough for anything to follow its verdicts."""
         return self.predictor.fitted and self.predictor_accurate
 
-    def _guide(self, predicts: bool = False) -> Guide:
+    def _guide(self, asks: bool = True, predicts: bool = False) -> Guide:
+        """:param asks: whether E is asked; else there are known masks alone."""
+        predictor = self.predictor if asks else None
         squashed = self.policy.squash_output
-        guide = Guide(self.predictor, self.action_space, self.n_candidates, squashed, self.device, predicts)
+        guide = Guide(predictor, self.action_space, self.n_candidates, squashed, self.device, predicts)
         guide.logger = None if predicts else self.logger
         return guide
 
@@ -263,9 +298,16 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
     ) -> tuple[np.ndarray[Any, Any], tuple[np.ndarray[Any, Any], ...] | None]:
         """SB3's ``predict``.
 
+        ``permissible_actions`` hold here, too.
+
         :param guided: restrict the policy to what E permits, as soon as E was fitted; ``alpha`` is ignored
         """
-        if not (guided and self.predictor.fitted):
+        asks, source = guided and self.predictor.fitted, self._permissible_actions
+        if not asks and source is None:
             return super().predict(observation, state, episode_start, deterministic)
-        with self._guided_by(self._guide(predicts=True)):
+        guide = self._guide(asks, predicts=True)
+        if source is not None:
+            masks = masks_at(self, source, observation)
+            guide.known_masks = lambda: masks
+        with self._guided_by(guide):
             return super().predict(observation, state, episode_start, deterministic)

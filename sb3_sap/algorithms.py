@@ -12,6 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.constraints import ActionConstraint
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
 
 #: Dotted names of the lane-keeping constraints (section 5.1), because the algorithms import no environment.
@@ -109,11 +110,15 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
 
 def is_guided(algo: str) -> bool:
     """Whether the algorithm of that RL Zoo name learns permissibility."""
-    return algo in ALGORITHMS and issubclass(ALGORITHMS[algo], LearnedPermissibilityMixin)
+    return algo in ON_POLICY_ALGORITHMS or (
+        algo in ALGORITHMS and issubclass(ALGORITHMS[algo], LearnedPermissibilityMixin)
+    )
 
 
 def base_of(algo: str) -> str:
     """The RL Zoo name of an algorithm's base, such as ``"ddpg"`` of ``"ddpg_ap_ce2"``; for others, their own name."""
+    if algo in ON_POLICY_ALGORITHMS:
+        return algo.removesuffix("_ap")
     if algo not in ALGORITHMS:
         return algo
     bases = (cls for cls in ALGORITHMS[algo].__mro__ if not cls.__module__.startswith("sb3_sap."))

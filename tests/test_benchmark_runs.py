@@ -11,7 +11,7 @@ import torch as th
 
 from sb3_sap.benchmark.configurations import Configuration, parse_configuration, parse_configurations
 from sb3_sap.benchmark.groups import GROUPS
-from sb3_sap.benchmark.learners import CLASSES, make_model, settings_of
+from sb3_sap.benchmark.learners import CLASSES, algorithm_class, is_on_policy, make_model, settings_of
 from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.recorder import Recorder, how_ended
 from sb3_sap.benchmark.runs import make_grid, make_run
@@ -218,7 +218,28 @@ def test_every_class_exists():
     for algo in CLASSES:
         if not algo.startswith("sbx_"):
             env = "CartPole-v1" if "dqn" in algo else "sap/LaneKeeping-v0"
-            assert make_model(algo, gym.make(env), {"buffer_size": 100}, 0).seed == 0
+            settings = {"n_steps": 64} if is_on_policy(algorithm_class(algo)) else {"buffer_size": 100}
+            assert make_model(algo, gym.make(env), settings, 0).seed == 0
+
+
+def test_an_on_policy_run_is_evaluated_after_its_updates():
+    of = run("ppo_ap:base+loss[n_steps=64]", steps=320)
+    assert of.settings["learning_rate"] == 0.001  # the base's own settings
+    assert of.settings["permissibility_coef"] == "lin_1.0_0.5"
+    assert of.checkpoints == [128, 192, 256, 320]  # of 100, 150, 200, 250
+    assert run("ppo:tuned", steps=600).checkpoints == [256, 512, 600]
+    result = train_and_evaluate(of, 0.0)
+    assert [row[0] for row in result["laps"]["data"]] == of.checkpoints
+    labelled = result["curve"]["data"][-1][-1]
+    assert 0 < labelled < 320
+
+
+def test_a_label_without_use_leaves_an_on_policy_run_as_its_base():
+    ours, base = (
+        train_and_evaluate(run(text, steps=256), 0.0) for text in ("ppo_ap:base+penalty[penalty=0]", "ppo:tuned")
+    )
+    assert ours["laps"] == base["laps"]
+    assert ours["episodes"] == base["episodes"]
 
 
 @pytest.mark.parametrize("algo", ["td3", "td3_ap"])

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from gymnasium import spaces
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS, base_of
 from sb3_sap.benchmark.configurations import CONTROLLERS, Configuration, unknown_algorithm
@@ -21,10 +22,16 @@ from sb3_sap.common.functions import resolve
 from sb3_sap.common.schedules import as_schedule
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.evaluation.laps import ENVIRONMENTS
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
+from sb3_sap.onpolicy.mixin import OnPolicyPermissibilityMixin
 from sb3_sap.presets import preset
 
 #: The class of each algorithm, which is imported only when it is needed.
-CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in ALGORITHMS.items()} | {
+CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in (ALGORITHMS | ON_POLICY_ALGORITHMS).items()} | {
+    "ppo": "stable_baselines3:PPO",
+    "a2c": "stable_baselines3:A2C",
+    "trpo": "sb3_contrib:TRPO",
+    "ppo_lstm": "sb3_contrib:RecurrentPPO",
     "dqn": "stable_baselines3:DQN",
     "qrdqn": "sb3_contrib:QRDQN",
     "ddpg_ap_unbalanced": "sb3_sap.benchmark.ablated:DDPGAPUnbalanced",
@@ -55,7 +62,7 @@ def plain_name(algo: str) -> str:
     return NAMESAKES.get(algo, algo)
 
 
-def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
+def algorithm_class(algo: str) -> type[BaseAlgorithm]:
     """The class of an algorithm.
 
     :raise ValueError: if there is no such algorithm, or if it needs SBX, which is not installed
@@ -64,12 +71,17 @@ def algorithm_class(algo: str) -> type[OffPolicyAlgorithm]:
         raise unknown_algorithm(algo, [*CLASSES, *CONTROLLERS])
     module, _, name = CLASSES[algo].partition(":")
     try:
-        found: type[OffPolicyAlgorithm] = getattr(importlib.import_module(module), name)
+        found: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as error:
         if module != "sbx":
             raise
         raise ValueError(f"{algo} needs SBX, and {error.name} is missing: pip install 'sb3-sap[sbx]'.") from error
     return found
+
+
+def is_on_policy(cls: type[BaseAlgorithm]) -> bool:
+    """Whether an algorithm learns from rollouts."""
+    return issubclass(cls, OnPolicyAlgorithm)
 
 
 def settings_of(configuration: Configuration, simulator: str, steps: int) -> dict[str, Any]:
@@ -126,14 +138,14 @@ def environment_of(configuration: Configuration) -> dict[str, Any]:
     return {key.removeprefix(ENVIRONMENT): v for key, v in configuration.changes.items() if key.startswith(ENVIRONMENT)}
 
 
-def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> OffPolicyAlgorithm:
+def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> BaseAlgorithm:
     """Builds a model on the CPU, where networks this small are fastest.
 
     :param settings: constructor arguments as YAML writes them
     """
     cls = algorithm_class(algo)
     arguments = copy.deepcopy(dict(settings))
-    if not issubclass(cls, SettingsMixin):  # whose constructor converts YAML values itself
+    if not issubclass(cls, (SettingsMixin, OnPolicyPermissibilityMixin)):  # which convert YAML values themselves
         if isinstance(arguments.get("action_noise"), Mapping):
             arguments["action_noise"] = make_action_noise(arguments["action_noise"], env.action_space)
         if "learning_rate" in arguments:
@@ -143,6 +155,8 @@ def make_model(algo: str, env: Any, settings: Mapping[str, Any], seed: int) -> O
     if "policy_kwargs" in arguments:
         arguments["policy_kwargs"] = with_extractor(arguments["policy_kwargs"])
     policy = "MultiInputPolicy" if isinstance(env.observation_space, spaces.Dict) else "MlpPolicy"
+    if algo.startswith("ppo_lstm"):
+        policy = policy.replace("Policy", "LstmPolicy")
     return cls(policy, env, seed=seed, device="cpu", **arguments)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
+from sb3_sap.predictor.learned import LearnedPredictorMixin
 
 #: Training steps between two points of a curve.
 INTERVAL = 25
@@ -134,7 +134,7 @@ class Recorder(BaseCallback):
         known = [accuracy for accuracy in self._accuracies if not np.isnan(accuracy)]
         self._accuracies = []
         accuracy = [round(sum(known) / len(known), 4), round(min(known), 4)] if known else [None, None]
-        mistakes = self.model.knowledge.seen[0] if isinstance(self.model, LearnedPermissibilityMixin) else None
+        mistakes = self.model.knowledge.seen[0] if isinstance(self.model, LearnedPredictorMixin) else None
         self.curve.append([self.num_timesteps, round(sum(self._rewards) / len(self._rewards), 3), *accuracy, mistakes])
 
 

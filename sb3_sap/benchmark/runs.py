@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from sb3_sap.benchmark.configurations import Configuration
-from sb3_sap.benchmark.learners import defaults_of, environment_of, settings_of
+from sb3_sap.benchmark.learners import algorithm_class, defaults_of, environment_of, is_on_policy, settings_of
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.benchmark.task_settings import entry, evaluations
 from sb3_sap.evaluation.laps import ENVIRONMENTS
@@ -95,6 +96,8 @@ def make_run(
         steps = steps if configuration.learns else 0
         checkpoints = evaluations(steps) if configuration.learns else [0]
     defaults = defaults_of(configuration, settings)
+    if configuration.learns and is_on_policy(algorithm_class(configuration.algo)):
+        checkpoints = _after_rollouts(checkpoints, (defaults | settings)["n_steps"])
     return Run(
         simulator,
         configuration.algo,
@@ -107,6 +110,13 @@ def make_run(
         checkpoints,
         [track for track in at_the_end if track in tracks],
     )
+
+
+def _after_rollouts(checkpoints: list[int], n_steps: int) -> list[int]:
+    """The ends of the rollouts, after which an on-policy algorithm learns, that follow checkpoints; the last stays."""
+    *earlier, last = checkpoints
+    ends = {math.ceil(point / n_steps) * n_steps for point in earlier}
+    return sorted({end for end in ends if end < last} | {last})
 
 
 def make_grid(

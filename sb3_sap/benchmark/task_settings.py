@@ -15,6 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_sap.algorithms import ALGORITHMS, base_of, is_guided
 from sb3_sap.common.errors import nearest
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.presets import algorithms, load_config, preset_names, settings_in
 from sb3_sap.presets import preset as settings_of_preset
 
@@ -35,6 +36,7 @@ ANY_TASK = ("penalty", "loss")
 #: Settings of guided algorithms that say how labels are used, and not what they are.
 GUIDANCE = (
     set(inspect.signature(ActionPermissibilityMixin).parameters) - set(inspect.signature(OffPolicyAlgorithm).parameters)
+    | {"predictor_epochs"}
 ) - {"ap_function", "potential", "constraint", "permissible_actions", "actor_learning_rate"}
 
 
@@ -43,7 +45,7 @@ def guided_algorithms(env_id: str) -> list[str]:
 
     :raise ValueError: if there is none
     """
-    guided = [algo for algo in ALGORITHMS if is_guided(algo)]
+    guided = [algo for algo in (*ALGORITHMS, *ON_POLICY_ALGORITHMS) if is_guided(algo) and algo in algorithms()]
     found = [algo for algo in guided if env_id in load_config(algo)]
     if not found:
         known = {name for algo in guided for name in load_config(algo) if "-v" in name}

@@ -10,7 +10,7 @@ import gymnasium as gym
 import torch as th
 
 from sb3_sap.benchmark.episodes import RETURN_COLUMNS, evaluation
-from sb3_sap.benchmark.learners import make_model
+from sb3_sap.benchmark.learners import is_on_policy, make_model
 from sb3_sap.benchmark.linear import LinearFeedback
 from sb3_sap.benchmark.oracle import oracle_episodes
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS, Clock, Recorder
@@ -52,8 +52,10 @@ def train_and_evaluate(run: Run, began: float, snapshot: Path | None = None) -> 
 
 
 def _learn(model: Any, steps: int, recorder: Recorder, clock: Clock, path: Path | None) -> None:
-    """Trains, from a snapshot if there is one; models of other libraries cannot be saved with their generators."""
-    if path is None or not isinstance(model.policy, th.nn.Module):
+    """Trains, from a snapshot if there is one; models of other libraries cannot be saved with their generators,
+    and on-policy algorithms take a minute.
+    """
+    if path is None or not isinstance(model.policy, th.nn.Module) or is_on_policy(type(model)):
         model.learn(steps, callback=recorder)
         return
     snapshots = SnapshotCallback(path, recorder, clock)

@@ -18,11 +18,15 @@ class A2CAP(OnPolicyPermissibilityMixin, A2C):
 
 
 class TRPOAP(OnPolicyPermissibilityMixin, TRPO):
-    """TRPO guided by action permissibility.
+    """TRPO guided by action permissibility, without the loss: its step is a line search, which has no place for it."""
 
-    Only the critic and the permissibility loss use the policy's optimizer, whose steps with Adam depend on how β
-    changes rather than on β.
-    """
+    def _check_settings(self) -> None:
+        super()._check_settings()
+        if self.permissibility_coef != 0:
+            raise ValueError(
+                f"`permissibility_coef` = {self.permissibility_coef!r} cannot be used by TRPOAP, whose step is a line "
+                "search on the policy's own objective: leave it out, or choose PPOAP."
+            )
 
 
 class RecurrentPPOAP(OnPolicyPermissibilityMixin, RecurrentPPO):

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_sap.common.arrays import FloatArray, copy_observation
+from sb3_sap.common.arrays import BoolArray, FloatArray, copy_observation
 from sb3_sap.predictor.labelling import set_row, take_in
 
 
@@ -25,8 +25,13 @@ class LabelCallback(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
+        #: (n_envs,) labels of each step of the rollout; empty if there are none.
+        self.labels: list[BoolArray] = []
         #: What the last step adds to the rewards that are learned from, (n_envs,); ``None``: nothing.
         self.added: FloatArray | None = None
+
+    def _on_rollout_start(self) -> None:
+        self.labels = []
 
     def _on_step(self) -> bool:
         model, normalize = self.model, self.model.get_vec_normalize_env()
@@ -45,9 +50,11 @@ class LabelCallback(BaseCallback):
         actions = self.locals["clipped_actions"]
         if isinstance(model.action_space, spaces.Box):
             actions = model.policy.scale_action(actions)
-        added = take_in(
+        labels, added = take_in(
             model.labelled, model.action_space, obs, next_obs, actions, rewards, self.locals["dones"], infos
         )
+        if labels is not None:
+            self.labels.append(labels)
         if added is not None and normalize is not None and normalize.norm_reward:
             added = normalize.normalize_reward(rewards + added) - normalize.normalize_reward(rewards)
         self.added = added

@@ -1,10 +1,10 @@
-"""A loss towards permissible actions after each update of an on-policy algorithm (not in the paper)."""
+"""A loss towards permissible actions within the updates of an on-policy algorithm (not in the paper)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from torch.nn import functional as F
@@ -14,38 +14,48 @@ from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.masks import joint_log_probs
 
 
-@flush_denormals()
-def permissibility_passes(model: Any, guide: Guide, coef: float, n_passes: int) -> float:
-    """Mini-batch gradient steps of the policy on β times :func:`losses`, over the states of the last rollout.
+class PermissibilityLoss:
+    """β times :func:`losses`, whose gradient joins that of the base algorithm's own loss.
 
-    They are steps of the policy's own optimizer, with the base's mini-batches and its bound on the gradient. The
-    base's policy gradient is in units of the advantage; where it is not normalised, β is multiplied by the standard
-    deviation of the rollout's advantages, so that one β suits rewards of every scale.
-
-    :param model: an on-policy model after ``train()``
-    :param coef: β
-    :param n_passes: passes over the rollout
-    :return: the mean loss, without β
+    :param guide: with E, and with the known masks of the rollout
+    :param coef: β times the trust in the labels, in units of the advantages that the base learns from
+    :param record: is called with the mean loss of each mini-batch, without the coefficient
     """
-    policy, buffer = model.policy, model.rollout_buffer
-    policy.set_training_mode(False)  # an extra pass must not move running statistics
-    scale = 1.0 if getattr(model, "normalize_advantage", False) else float(np.std(buffer.advantages))
-    trained = [parameter for parameter in policy.parameters() if parameter.requires_grad]
-    found = []
-    for _ in range(n_passes):
-        for data in buffer.get(getattr(model, "batch_size", None)):
-            if hasattr(data, "lstm_states"):
-                distribution, _ = policy.get_distribution(data.observations, data.lstm_states.pi, data.episode_starts)
-                loss = losses(guide, data.observations, distribution)[data.mask > 1e-8].mean()  # not the padding
-            else:
-                loss = losses(guide, data.observations, policy.get_distribution(data.observations)).mean()
-            policy.optimizer.zero_grad()
-            (coef * scale * loss).backward(inputs=trained)  # type: ignore[no-untyped-call]
-            if model.max_grad_norm > 0:  # 0 for TRPO
-                th.nn.utils.clip_grad_norm_(trained, model.max_grad_norm)
-            policy.optimizer.step()
-            found.append(loss.item())
-    return float(np.mean(found))
+
+    def __init__(self, guide: Guide, coef: float, record: Callable[[float], None]):
+        self.guide, self.coef, self.record = guide, coef, record
+
+    @flush_denormals()
+    def added_to(self, log_prob: th.Tensor, obs: Any, distribution: Distribution, recurrent: bool) -> th.Tensor:
+        """Log-probabilities as they are, through which a backward pass also differentiates this loss.
+
+        The base's mini-batches, its bound on the gradient and its optimizer's step are then those of the sum.
+
+        :param log_prob: (n,) of the executed actions, to which any loss of a policy gradient leads back
+        :param obs: n observation tensors
+        :param distribution: of the policy alone in these states
+        :param recurrent: whether zeros pad the sequences of observations
+        """
+        found = losses(self.guide, obs, distribution)
+        if recurrent:
+            entries = obs.values() if isinstance(obs, dict) else [obs]
+            real = th.stack([entry.flatten(1).ne(0).any(dim=1) for entry in entries]).any(dim=0)
+            found = found[real] if real.any() else found
+        loss = found.mean()
+        self.record(loss.item())
+        return _WithLoss.apply(log_prob, self.coef * loss)  # type: ignore[no-any-return, no-untyped-call]
+
+
+class _WithLoss(th.autograd.Function):
+    """The identity of its first argument, whose backward pass gives the second, a loss, the gradient 1."""
+
+    @staticmethod
+    def forward(ctx: Any, values: th.Tensor, loss: th.Tensor) -> th.Tensor:
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> Any:  # type: ignore[override]
+        return gradient, th.ones((), dtype=gradient.dtype, device=gradient.device)
 
 
 def losses(guide: Guide, obs: Any, distribution: Distribution) -> th.Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -27,8 +28,9 @@ from sb3_sap.common.watching import every_callback
 from sb3_sap.guidance.masks import PermissibleActions, mask_source, masks_at, masks_of
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.labels import LabelCallback, shaped_rewards
-from sb3_sap.onpolicy.loss import permissibility_passes
+from sb3_sap.onpolicy.loss import PermissibilityLoss
 from sb3_sap.onpolicy.policy import GuidedPolicyMixin, guided_policy_class
+from sb3_sap.onpolicy.trust import Agreement
 from sb3_sap.predictor.building import make_knowledge
 from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
@@ -43,8 +45,8 @@ MOST_COMBINATIONS = 4_096
 class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAlgorithm):
     """Guides an SB3 on-policy algorithm with a learned AP predictor E.
 
-    Goes before the algorithm in the bases of a class. E is fixed while a rollout is collected and learned from; it is
-    fitted afterwards, in proportion to the new labels. While it is accurate, its verdicts restrict the rollout:
+    Goes before the algorithm in the bases of a class. E is fixed while a rollout is collected, and then fitted, in
+    proportion to the new labels. While it is accurate, its verdicts restrict the rollout:
 
     - Finite actions are masked. Log-probabilities and entropy are those of the masked distribution, in the update
       with the same masks. For ``MultiDiscrete`` and ``MultiBinary`` actions E judges each combination.
@@ -60,11 +62,10 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
     :param n_candidates: number of draws from a policy of continuous actions
     :param predictor_epochs: how often, on average, fits of E see each labelled action, like ``n_epochs`` of PPO; the
         first 2,000 count eight times (:func:`~sb3_sap.predictor.schedule.weighted_labels`)
-    :param permissibility_coef: β of a loss towards permissible actions after each update of the policy
-        (:func:`~sb3_sap.onpolicy.loss.permissibility_passes`), a number, a schedule, or ``"lin_1.0_0.5"``, which fades
-        to 0 in the middle of ``learn``: a label that a good policy sometimes violates would bias the end. It is
-        applied while E is accurate, whatever ``alpha``
-    :param permissibility_epochs: passes over the rollout for that loss
+    :param permissibility_coef: β of a loss towards permissible actions within the updates of the policy
+        (:func:`~sb3_sap.onpolicy.loss.losses`), in units of the advantages: a number, a schedule, or ``"lin_2.0"``. It
+        is multiplied by the agreement of labels and advantages (:class:`~sb3_sap.onpolicy.trust.Agreement`), so that
+        it fades by itself, and is applied while E is accurate, whatever ``alpha``
     :param permissible_actions: for finite actions, a :class:`~sb3_sap.guidance.masks.PermissibleActions` or its dotted
         name, or the key of a mask in a ``Dict`` observation
         (:class:`~sb3_sap.guidance.mask_wrapper.ActionMaskObservation`). What it does not allow has probability 0, in
@@ -80,8 +81,8 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
     held: ClassVar[tuple[str, ...]] = ("use_sde",)
     #: Settings that may be numbers, schedules or ``"lin_<number>"``.
     schedules: ClassVar[tuple[str, ...]] = ("learning_rate", "clip_range", "permissibility_coef")
-    #: E must not change between a rollout and the update that learns from it.
-    fits_after_update: ClassVar[bool] = True
+    #: E must not change within a rollout, however often the callback is called.
+    fits_in_train: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -92,7 +93,6 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         n_candidates: int = 32,
         predictor_epochs: float = 5,
         permissibility_coef: float | Schedule | str = 0.0,
-        permissibility_epochs: int = 4,
         permissible_actions: PermissibleActions | str | None = None,
         **kwargs: Any,
     ):
@@ -100,10 +100,11 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         self.n_candidates = n_candidates
         self.predictor_epochs = predictor_epochs
         self.permissibility_coef: Any = permissibility_coef
-        self.permissibility_epochs = permissibility_epochs
         self.permissible_actions = permissible_actions
         #: Holds K; saved with the model.
         self.labelled = cast(LabelledTransitions, None)
+        #: Of the labels with the advantages of the last rollouts.
+        self.agreement = Agreement()
         self._rollout_guide: Guide | None = None  # of the rollout in progress, and thus of its update
         self._labels_seen = 0  # labels that fits of E are due for or were made for
         self._examples_due = 0.0  # examples that E has yet to see
@@ -159,7 +160,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
                 f"`alpha` is 1 (E guides once it is accurate) or 0 (it never does), because the update must know the "
                 f"masks, but is {self.alpha!r}."
             )
-        check_at_least(self, n_candidates=1, permissibility_epochs=1)
+        check_at_least(self, n_candidates=1)
         if self.permissible_actions is not None and isinstance(self.action_space, spaces.Box):
             raise ValueError(
                 f"`permissible_actions` of an on-policy algorithm masks finite actions, but the action space is "
@@ -237,17 +238,26 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
         return masks_of(cast(PermissibleActions, self._permissible_actions), self.action_space, self.raw_last_obs())
 
     def train(self) -> None:
-        """SB3's ``train`` with the masks of the rollout; then fits of E, and the loss towards permissible actions."""
-        with self._guided_by(self._rollout_guide):
-            super().train()
+        """Fits of E to the new labels; then SB3's ``train``, with the masks of the rollout and the loss on E."""
         self._refit()
-        coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining)
+        if self._label_callback.labels:
+            self.agreement.update(np.stack(self._label_callback.labels), self.rollout_buffer.advantages)
+        coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining) * float(self.agreement)
+        policy = cast(GuidedPolicyMixin, self.policy)
         if coef > 0 and self._judges:
-            guide = self._guide(asks=True)
+            guide = self._guide()
             if self._rollout_guide is not None:
                 guide.known = self._rollout_guide.known
-            loss = permissibility_passes(self, guide, coef, self.permissibility_epochs)
-            self.logger.record("sap/permissibility_loss", loss)
+            # The policy gradient is in units of the advantage.
+            scale = 1.0 if getattr(self, "normalize_advantage", False) else float(np.std(self.rollout_buffer.advantages))
+            record = partial(self.logger.record_mean, "sap/permissibility_loss")
+            policy.permissibility_loss = PermissibilityLoss(guide, coef * scale, record)
+        self.logger.record("sap/agreement", float(self.agreement))
+        try:
+            with self._guided_by(self._rollout_guide):
+                super().train()
+        finally:
+            policy.permissibility_loss = None
 
     def _refit(self) -> None:
         """Fits E so often that it sees each new label as often as ``predictor_epochs`` says, on average."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import torch as th
 from gymnasium import spaces
@@ -13,6 +13,11 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_sap.onpolicy.guide import Guide
+from sb3_sap.onpolicy.loss import PermissibilityLoss
+
+
+#: Attributes that copies and files do not hold.
+OF_A_PASS = ("guide", "permissibility_loss", "_unguided", "_pass")
 
 
 class GuidedPolicyMixin(ActorCriticPolicy):
@@ -24,6 +29,9 @@ class GuidedPolicyMixin(ActorCriticPolicy):
     """
 
     guide: Guide | None = None
+    #: Is added to the loss of an update, if the model sets it.
+    permissibility_loss: PermissibilityLoss | None = None
+    _unguided: Distribution | None = None  # of the pass in progress
     _pass: tuple[Any, th.Tensor | None] | None = None  # (observations, executed actions) of the pass in progress
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
@@ -38,7 +46,13 @@ class GuidedPolicyMixin(ActorCriticPolicy):
     def evaluate_actions(self, obs: Any, actions: th.Tensor, *args: Any, **kwargs: Any) -> Any:
         if isinstance(self.action_space, spaces.MultiBinary):
             actions = actions.float()  # sb3-contrib's recurrent buffer has bytes, which torch refuses
-        return self._guided(super().evaluate_actions, obs, actions, (obs, actions, *args), kwargs)
+        result = self._guided(super().evaluate_actions, obs, actions, (obs, actions, *args), kwargs)
+        if self.permissibility_loss is None:
+            return result
+        values, log_prob, entropy = result
+        unguided, self._unguided = cast(Distribution, self._unguided), None
+        recurrent = hasattr(self, "lstm_actor")
+        return values, self.permissibility_loss.added_to(log_prob, obs, unguided, recurrent), entropy
 
     def get_distribution(self, obs: Any, *args: Any, **kwargs: Any) -> Any:
         return self._guided(super().get_distribution, obs, None, (obs, *args), kwargs)
@@ -56,7 +70,7 @@ class GuidedPolicyMixin(ActorCriticPolicy):
     def _guided(
         self, method: Callable[..., Any], obs: Any, executed: th.Tensor | None, args: tuple[Any, ...], kwargs: Any
     ) -> Any:
-        if self.guide is None:
+        if self.guide is None and self.permissibility_loss is None:
             return method(*args, **kwargs)
         self._pass = (obs, executed)
         try:
@@ -72,14 +86,16 @@ class GuidedPolicyMixin(ActorCriticPolicy):
 
     def _get_action_dist_from_latent(self, *args: Any, **kwargs: Any) -> Distribution:
         distribution = super()._get_action_dist_from_latent(*args, **kwargs)
-        if self.guide is None or self._pass is None:
+        if self._pass is None:
             return distribution
         (obs, executed), self._pass = self._pass, None
-        return self.guide.distribution(obs, distribution, executed)
+        if executed is not None:
+            self._unguided = distribution
+        return distribution if self.guide is None else self.guide.distribution(obs, distribution, executed)
 
     def __reduce__(self) -> Any:
         # The class cannot be found by its name, and a copy made amid a rollout is the policy alone.
-        state = {name: value for name, value in vars(self).items() if name not in ("guide", "_pass")}
+        state = {name: value for name, value in vars(self).items() if name not in OF_A_PASS}
         return _new, (type(self).__mro__[2],), state
 
 

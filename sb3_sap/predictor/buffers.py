@@ -57,7 +57,7 @@ class KnowledgeMixin(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         # SB3 passes raw observations here, and the true last one of an episode.
-        added = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
+        _, added = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
         if added is not None:
             reward = reward + added
         super().add(obs, next_obs, action, reward, done, infos)

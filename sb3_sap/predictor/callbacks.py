@@ -55,7 +55,7 @@ class PermissibilityCallback(BaseCallback):
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)
-        if not getattr(self.model, "fits_after_update", False):
+        if not getattr(self.model, "fits_in_train", False):
             n_envs = self.model.n_envs
             due = self.model.refits_due(self._start // n_envs, self.model.lifetime_steps // n_envs)
             self.refit(int(min(due, self.model.fits_per_rollout)))

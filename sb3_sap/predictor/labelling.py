@@ -59,7 +59,7 @@ def take_in(
     reward: np.ndarray[Any, Any],
     done: np.ndarray[Any, Any],
     infos: list[dict[str, Any]],
-) -> FloatArray | None:
+) -> tuple[BoolArray | None, FloatArray | None]:
     """Labels n executed actions and adds them to K.
 
     :param obs: raw, (n, *obs_shape)
@@ -68,7 +68,7 @@ def take_in(
     :param action: scaled, (n, *action_shape)
     :param reward: of the environment, (n,)
     :param done: (n,) whether the episode ended
-    :return: (n,) what is added to the rewards; ``None``: nothing
+    :return: (n,) the labels and (n,) what is added to the rewards; ``None``: there are none, nothing is added
     """
     for i, info in enumerate(infos):
         if RAW_LAST in info:
@@ -83,10 +83,10 @@ def take_in(
         holder.knowledge.add(obs, action.reshape(len(labels), -1), labels)
     holder.reward_scale.update(reward)
     if not holder.shaping:
-        return None
+        return labels, None
     truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
     terminal = np.asarray(done, dtype=bool) & ~truncated
-    return holder.shaping.difference(labels, before, after, terminal, float(holder.reward_scale))
+    return labels, holder.shaping.difference(labels, before, after, terminal, float(holder.reward_scale))
 
 
 def unscaled(action_space: spaces.Space[Any], action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

@@ -8,6 +8,7 @@ from sb3_sap.tasks.driving import highway, parking
 from sb3_sap.tasks.energy import acrobot, mountain_car, mountain_car_continuous
 from sb3_sap.tasks.pendulum import pendulum_energy, pendulum_height, pendulum_torque
 from sb3_sap.tasks.reach import fetch_reach, nearness
+from sb3_sap.tasks.taxi import taxi
 
 __all__ = [
     "acrobot",
@@ -20,4 +21,5 @@ __all__ = [
     "pendulum_energy",
     "pendulum_height",
     "pendulum_torque",
+    "taxi",
 ]

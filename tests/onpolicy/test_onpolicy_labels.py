@@ -158,7 +158,6 @@ def test_loss_of_finite_actions_is_that_of_the_permitted_probability():
         Recorder(MULTI_DISCRETE),
         alpha=0,
         permissibility_coef=1.0,
-        permissibility_epochs=1,
         learning_rate=0.0,
     )
     for parameter in model.policy.action_net.parameters():

@@ -18,7 +18,6 @@ from sb3_sap.presets import preset_names
     [
         ({"alpha": 0.5}, "^`alpha` is 1 .* or 0 .* but is 0.5"),
         ({"n_candidates": 0}, "^`n_candidates` must be a whole number of at least 1"),
-        ({"permissibility_epochs": 0}, "^`permissibility_epochs` must be a whole number of at least 1"),
         ({"permissibility_coef": -1.0}, "^`permissibility_coef` must be at least 0"),
         ({"permissibility_coef": "high"}, "^`permissibility_coef` must be a number, a schedule"),
         ({"predictor_epochs": -1}, "^`predictor_epochs` must be a number of at least 0"),

@@ -85,6 +85,11 @@ GROUPS: dict[str, list[str]] = {
             "fast",
         )
     ],
+    # The same for PPO.
+    "on_policy": [
+        f"ppo_ap:{presets}"
+        for presets in ("base+penalty[penalty=0]", "base+penalty[penalty=50]", "base+penalty", "base+loss")
+    ],
     # The same with labels that are wrong: one in ten, or all in a region.
     "wrong_labels": [
         "ddpg_ap:base+penalty[penalty=0]",

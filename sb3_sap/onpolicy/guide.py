@@ -105,7 +105,7 @@ class Guide:
         return th.as_tensor(mask, device=self.actions.device)
 
     def _verdicts(self, obs: Any, states: list[bytes]) -> BoolArray:
-        """E's masks. Each state of a rollout is judged once, and its mask is kept for the update, before which E changes."""
+        """E's masks. A state is judged once in a rollout, and keeps its mask in the update, before which E changes."""
         assert self.actions is not None
         assert self.predictor is not None
         new = [row for row, state in enumerate(states) if state not in self._judged]

@@ -54,7 +54,7 @@ class _WithLoss(th.autograd.Function):
         return values.view_as(values)
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, gradient: th.Tensor) -> Any:
         return gradient, th.ones((), dtype=gradient.dtype, device=gradient.device)
 
 

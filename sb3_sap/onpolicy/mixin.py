@@ -249,7 +249,9 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
             if self._rollout_guide is not None:
                 guide.known = self._rollout_guide.known
             # The policy gradient is in units of the advantage.
-            scale = 1.0 if getattr(self, "normalize_advantage", False) else float(np.std(self.rollout_buffer.advantages))
+            scale = (
+                1.0 if getattr(self, "normalize_advantage", False) else float(np.std(self.rollout_buffer.advantages))
+            )
             record = partial(self.logger.record_mean, "sap/permissibility_loss")
             policy.permissibility_loss = PermissibilityLoss(guide, coef * scale, record)
         self.logger.record("sap/agreement", float(self.agreement))

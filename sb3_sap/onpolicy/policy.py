@@ -15,7 +15,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.loss import PermissibilityLoss
 
-
 #: Attributes that copies and files do not hold.
 OF_A_PASS = ("guide", "permissibility_loss", "_unguided", "_pass")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sb3_sap.common.arrays import BoolArray, FloatArray
@@ -38,4 +40,4 @@ class Agreement:
         if n == 0 or not self._labels.any() or self._labels.all() or not self._advantages.std() > 0:
             return 0.0
         correlation = float(np.corrcoef(self._labels, self._advantages)[0, 1])
-        return max(0.0, correlation - 2 / float(n) ** 0.5)
+        return max(0.0, correlation - 2 / math.sqrt(n))

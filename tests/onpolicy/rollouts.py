@@ -86,11 +86,22 @@ def build_on_policy(algorithm: Any, env: Any = None, **overrides: Any) -> Any:
     return algorithm(policy, Line() if env is None else env, **settings(algorithm, **overrides))
 
 
+class Agrees:
+    """In place of an `Agreement`: advantages that agree with the labels as far as possible."""
+
+    def update(self, labels: Any, advantages: Any) -> None:
+        pass
+
+    def __float__(self) -> float:
+        return 1.0
+
+
 def judged_by(logits_of: Any, algorithm: Any = PPOAP, env: Any = None, **overrides: Any) -> Any:
-    """A model with a classifier of known verdicts, which has passed its gate and fits nothing."""
+    """A model with a classifier of known verdicts, which has passed its gate, is trusted, and fits nothing."""
     model = build_on_policy(algorithm, env, **({"ap_function": never_labels} | overrides))
     model.predictor = StubPredictor(logits_of)
     model.validation_accuracy = 1.0
+    model.agreement = Agrees()
     model.set_logger(Logger(None, []))
     return model
 

@@ -9,9 +9,11 @@ from rollouts import MULTI_DISCRETE, Recorder, build_on_policy, even, judged_by,
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stubs import above
-from toy import Line, centred
+from toy import Line, centred, towards_centre
 
 from sb3_sap import A2CAP, PPOAP, PermissibilityCallback, RecurrentPPOAP
+from sb3_sap.onpolicy.loss import PermissibilityLoss, losses
+from sb3_sap.onpolicy.trust import Agreement
 from sb3_sap.predictor.schedule import weighted_labels
 
 
@@ -111,6 +113,10 @@ def test_potential_is_added_to_the_rewards():
     assert shaped.rollout_buffer.rewards[0, 0] == pytest.approx(reward + 0.99 * reward + x, abs=1e-5)
 
 
+def away_from_centre(obs, actions, next_obs):
+    return ~towards_centre(obs, actions, next_obs)
+
+
 class Fits(PermissibilityCallback):
     """Counts fits at each number of updates, while no guide is set."""
 
@@ -124,13 +130,13 @@ class Fits(PermissibilityCallback):
         super().fit()
 
 
-def test_fits_follow_each_update_in_proportion_to_the_new_labels():
+def test_fits_precede_each_update_in_proportion_to_the_new_labels():
     callback = Fits()
     model = build_on_policy(PPOAP, Line(n_actions=3), predictor_epochs=0.25)
     model.learn(64, callback)
     # 16 new labels, which count eight times, are at a quarter of an epoch two samples of 16; an update has two epochs.
     assert [steps for steps, _ in callback.found] == [16, 16, 32, 32, 48, 48, 64, 64]
-    assert [updates for _, updates in callback.found] == [2, 2, 4, 4, 6, 6, 8, 8]
+    assert [updates for _, updates in callback.found] == [0, 0, 2, 2, 4, 4, 6, 6]
 
 
 def test_fits_of_short_rollouts_accumulate():
@@ -149,6 +155,81 @@ def test_fits_wait_for_both_classes_and_then_are_bounded_by_what_k_holds():
 
 def test_first_labels_count_eight_times():
     assert [weighted_labels(n) for n in (0, 1, 2000, 2001, 10_000)] == [0, 8, 16_000, 16_001, 24_000]
+
+
+def test_gradient_of_the_loss_joins_that_of_the_base():
+    model = judged_by(above(0.0), PPOAP, alpha=0)
+    obs, actions = th.ones(3, 2), th.zeros(3, 1)
+    log_std, action_net = model.policy.log_std, model.policy.action_net.weight
+
+    def gradients(of):
+        model.policy.zero_grad()
+        of().backward()
+        return log_std.grad.clone(), action_net.grad.clone()
+
+    def loss_alone():
+        return 0.7 * losses(model._guide(), obs, model.policy.get_distribution(obs)).mean()
+
+    base = gradients(lambda: model.policy.evaluate_actions(obs, actions)[1].sum())
+    extra = gradients(lambda: loss_alone() + 0 * log_std.sum())
+    model.policy.permissibility_loss = PermissibilityLoss(model._guide(), 0.7, lambda loss: None)
+    both = gradients(lambda: model.policy.evaluate_actions(obs, actions)[1].sum())
+    for ours, one, other in zip(both, base, extra, strict=True):
+        assert th.allclose(ours, one + other, atol=1e-6)
+    assert not th.allclose(both[1], base[1])
+
+
+@pytest.mark.parametrize(
+    ("labels", "advantages", "expected"),
+    [
+        ([True, False] * 500, [1.0, -1.0] * 500, 1 - 2 / math.sqrt(1000)),
+        ([True, False] * 500, [-1.0, 1.0] * 500, 0.0),  # the label contradicts the advantages
+        ([True, True, False, False] * 250, [1.0, -1.0, 1.0, -1.0] * 250, 0.0),  # independent
+        ([True, True, False, False] * 50, [3.0, 1.0, 1.0, -1.0] * 50, 1 / math.sqrt(2) - 2 / math.sqrt(200)),
+        ([True] * 1000, [1.0, -1.0] * 500, 0.0),
+        ([True, False] * 500, [0.5] * 1000, 0.0),
+        ([True, False], [1.0, -1.0], 0.0),  # two steps prove nothing
+        ([], [], 0.0),
+    ],
+)
+def test_agreement_is_the_correlation_less_twice_its_standard_error(labels, advantages, expected):
+    agreement = Agreement()
+    agreement.update(np.array(labels, dtype=bool).reshape(-1, 2), np.array(advantages).reshape(-1, 2))
+    assert float(agreement) == pytest.approx(expected, abs=1e-6)
+
+
+def test_agreement_is_measured_over_the_last_rollouts():
+    agreement, signs = Agreement(), np.array([[True], [False]] * 50)
+    for _ in range(6):  # 600 steps, of which the last 512 are kept
+        agreement.update(signs, np.where(signs, 1.0, -1.0))
+    assert float(agreement) == pytest.approx(1 - 2 / math.sqrt(512))
+    many = np.array([[True], [False]] * 1000)
+    agreement.update(many, np.where(many, -1.0, 1.0))  # a rollout that is longer replaces them all
+    assert float(agreement) == 0.0
+
+
+class Nearer(Line):
+    """A :class:`Line` that rewards coming nearer to the centre."""
+
+    def step(self, action):
+        before = abs(self.x)
+        obs, _, *rest = super().step(action)
+        return obs, 10 * (before - abs(self.x)), *rest
+
+
+def test_loss_follows_the_agreement():
+    """Labels that the advantages contradict are predicted well, and yet the model equals its base to the bit."""
+    settings = {"n_steps": 64, "gamma": 0.0, "learning_rate": 0.0}
+    own = {"alpha": 0, "permissibility_coef": 5.0, "predictor_epochs": 20}
+    right, wrong = (
+        build_on_policy(PPOAP, Nearer(), ap_function=f, **own, **settings).learn(320)
+        for f in (towards_centre, away_from_centre)
+    )
+    assert min(right.validation_accuracy, wrong.validation_accuracy) > 0.75
+    assert float(right.agreement) > 0.3
+    assert float(wrong.agreement) == 0
+    assert "sap/permissibility_loss" not in wrong.logger.name_to_value
+    assert right.logger.name_to_value["sap/permissibility_loss"] > 0
 
 
 def test_loss_of_finite_actions_is_that_of_the_permitted_probability():

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from states import flat, reseed
 from toy import Line
 
-from sb3_sap import PPOAP, GuidedPolicy
+from sb3_sap import PPOAP, TRPOAP, GuidedPolicy
 
 
 def knowledge_state(model):
@@ -25,12 +25,14 @@ def knowledge_state(model):
 
 @pytest.mark.parametrize("algorithm", BASES)
 def test_loaded_model_continues_as_the_saved_one(algorithm, tmp_path):
-    model = build_on_policy(algorithm, Line(n_actions=3), permissibility_coef=1.0, penalty="auto").learn(64)
+    coef = 0.0 if algorithm is TRPOAP else 1.0
+    model = build_on_policy(algorithm, Line(n_actions=3), permissibility_coef=coef, penalty="auto").learn(64)
     assert model.predictor.fitted
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", Line(n_actions=3))
     assert loaded.policy_class is model.policy_class
     assert loaded.validation_accuracy == model.validation_accuracy
+    assert float(loaded.agreement) == float(model.agreement)
     for one in (model, loaded):
         reseed(one)
         if hasattr(one, "_last_lstm_states"):  # sb3-contrib leaves the memory out of files

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from rollouts import BASES, Recorder, build_on_policy
 from toy import Line
 
-from sb3_sap import A2CAP, PPOAP, OnPolicyPermissibilityMixin, preset
+from sb3_sap import A2CAP, PPOAP, TRPOAP, OnPolicyPermissibilityMixin, preset
 from sb3_sap.presets import preset_names
 
 
@@ -29,6 +29,11 @@ from sb3_sap.presets import preset_names
 def test_setting_is_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         build_on_policy(PPOAP, **settings)
+
+
+def test_the_loss_is_refused_where_it_has_no_place():
+    with pytest.raises(ValueError, match=r"^`permissibility_coef` = 1\.0 cannot be used by TRPOAP"):
+        build_on_policy(TRPOAP, permissibility_coef=1.0)
 
 
 @pytest.mark.parametrize(

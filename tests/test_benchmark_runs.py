@@ -225,7 +225,7 @@ def test_every_class_exists():
 def test_an_on_policy_run_is_evaluated_after_its_updates():
     of = run("ppo_ap:base+loss[n_steps=64]", steps=320)
     assert of.settings["learning_rate"] == 0.001  # the base's own settings
-    assert of.settings["permissibility_coef"] == "lin_1.0_0.5"
+    assert of.settings["permissibility_coef"] == "lin_3.0"
     assert of.checkpoints == [128, 192, 256, 320]  # of 100, 150, 200, 250
     assert run("ppo:tuned", steps=600).checkpoints == [256, 512, 600]
     result = train_and_evaluate(of, 0.0)

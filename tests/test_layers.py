@@ -133,6 +133,7 @@ def test_imports_are_found_as_they_are_written():
         "sb3_sap.guidance.constrained",
         "sb3_sap.guidance.constraints",
         "sb3_sap.guidance.mixin",
+        "sb3_sap.onpolicy.algorithms",
         "sb3_sap.predictor.mixin",
     }
     assert "sb3_sap.envs.viewer" in used("sb3_sap.envs.lane_keeping")  # although only when something is drawn

@@ -23,6 +23,7 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
         LearnedPredictorMixin        settings of K and E, saving of E
         WatchedEnvironmentMixin      raw last observations, warnings about the training environment
         ConstrainedExplorationMixin  constraints and permissible actions
+        MaskedValuesMixin            masks of discrete actions
         SettingsMixin                settings that SB3 lacks
         EnvironmentMixin             spaces, wrappers, layouts
         SavingMixin                  what a file holds

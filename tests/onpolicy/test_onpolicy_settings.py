@@ -72,7 +72,7 @@ def test_off_policy_algorithm_is_refused():
 def test_model_is_built_from_each_preset(name):
     assert preset_names(PPOAP) == ["default", "penalty", "loss"]
     model = PPOAP("MlpPolicy", Line(), **preset(name, PPOAP))
-    assert model.penalty == ("auto" if name == "penalty" else 0.0)
+    assert model.penalty == ("auto_0.25" if name == "penalty" else 0.0)
 
 
 def test_schedules_may_be_written_as_in_yaml():

@@ -28,7 +28,7 @@ PENALTY = "base+penalty"
 GOOD = 0.95
 NOTE = (
     "All configurations of an algorithm share its base settings. Those with `penalty` or `loss` explore as the base "
-    "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of the root mean square of the "
+    "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of {size} of the "
     "rewards, and `penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as "
     "the interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over "
     "seeds, in which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. "
@@ -55,6 +55,8 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
+        # The presets of `zoo_configs`: PPO has a smaller penalty, and its loss has none beside it.
+        size="a quarter of the root mean square" if kind == "on_policy" else "the root mean square",
         reference=reference,
         good="linear feedback" if laps else "the configuration that ends best",
         tests="tracks (without Spring, whose long lap is driven at the end only)" if laps else "episodes",

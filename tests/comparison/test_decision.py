@@ -82,7 +82,8 @@ def test_code_of_every_way_can_be_run(algo, monkeypatch, tmp_path):
         assert scope["model"].num_timesteps >= 12
 
 
-def test_setting_of_the_user_goes_before_that_of_a_way(monkeypatch):
+def test_setting_of_the_user_goes_before_that_of_a_way(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("gymnasium.make", lambda name: Line())
     job = Job("Line-v0", {}, "ddpg_ap", {"learning_starts": 5, "batch_size": 4, "refit_growth": 0.125}, 0, 12, 10, 1)
     for way in ways("ddpg_ap", potential=True)[1:]:

@@ -101,7 +101,7 @@ for _name, _maker in {
 }.items():
     _maker.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make reads the render modes from it
     register(_name, f"{__name__}:{_maker.__name__}", max_episode_steps=MAX_EPISODE_STEPS)
-# That of Taxi-v3.
+# That of Gymnasium's Taxi.
 register("sap/Taxi-v0", f"{__name__}.taxi:DecodedTaxi", max_episode_steps=200)
 
 __all__ = [

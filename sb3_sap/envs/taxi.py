@@ -14,9 +14,9 @@ SIZES = [5, 5, 5, 4]
 
 
 class DecodedTaxi(gym.ObservationWrapper[Any, Any, Any]):
-    """``Taxi-v3``, which numbers its 500 states, with the four numbers that make up a state.
+    """Taxi, which numbers its 500 states, with the four numbers that make up a state.
 
-    :param render_mode: of ``Taxi-v3``
+    :param render_mode: of Taxi
     """
 
     def __init__(self, render_mode: str | None = None):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -42,7 +42,7 @@ def joint_log_probs(distribution: Distribution, actions: th.Tensor) -> th.Tensor
     )
 
 
-class MaskedDistribution(Distribution):
+class MaskedDistribution(CategoricalDistribution):
     """A policy's distribution over joint actions, given that the action is permitted.
 
     ``Discrete`` gives what sb3-contrib's ``MaskableCategorical`` gives, to the bit. For several dimensions the mask
@@ -54,10 +54,8 @@ class MaskedDistribution(Distribution):
     :param actions: (k, action_dim), those of :func:`~sb3_sap.common.spaces.joint_actions`
     """
 
-    distribution: Categorical
-
     def __init__(self, log_probs: th.Tensor, mask: th.Tensor, space: spaces.Space[Any], actions: th.Tensor):
-        super().__init__()  # type: ignore[no-untyped-call]
+        super().__init__(len(actions))
         rejected = th.tensor(REJECTED_LOGIT, dtype=log_probs.dtype, device=log_probs.device)
         self.distribution = Categorical(logits=th.where(mask, log_probs, rejected))
         self.space = space
@@ -66,10 +64,6 @@ class MaskedDistribution(Distribution):
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """(n,) of (n, *action_shape) actions."""
         return self.distribution.log_prob(index_of(self.space, actions))  # type: ignore[no-any-return, no-untyped-call]
-
-    def entropy(self) -> th.Tensor:
-        """(n,) of the masked distribution."""
-        return self.distribution.entropy()  # type: ignore[no-any-return, no-untyped-call]
 
     def sample(self) -> th.Tensor:
         """(n, *action_shape)."""
@@ -84,20 +78,6 @@ class MaskedDistribution(Distribution):
             return index
         actions = self.actions[index]
         return actions.float() if isinstance(self.space, spaces.MultiBinary) else actions  # as SB3's distributions do
-
-    # What SB3 builds distributions with, which this one is not built with.
-
-    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> Any:
-        raise NotImplementedError
-
-    def proba_distribution(self, *args: Any, **kwargs: Any) -> Self:
-        raise NotImplementedError
-
-    def actions_from_params(self, *args: Any, **kwargs: Any) -> th.Tensor:
-        raise NotImplementedError
-
-    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
-        raise NotImplementedError
 
 
 def index_of(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:

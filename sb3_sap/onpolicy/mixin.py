@@ -240,7 +240,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
     def train(self) -> None:
         """Fits of E to the new labels; then SB3's ``train``, with the masks of the rollout and the loss on E."""
         self._refit()
-        if self._label_callback.labels:
+        if len(self._label_callback.labels) == len(self.rollout_buffer.advantages):  # every step has labels
             self.agreement.update(np.stack(self._label_callback.labels), self.rollout_buffer.advantages)
         coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining) * float(self.agreement)
         policy = cast(GuidedPolicyMixin, self.policy)

@@ -10,7 +10,7 @@ from sb3_sap.common.arrays import BoolArray
 
 
 def taxi(obs: np.ndarray[Any, Any], actions: np.ndarray[Any, Any], next_obs: np.ndarray[Any, Any]) -> BoolArray:
-    """``sap/Taxi-v0`` and ``Taxi-v3``: False where the state did not change.
+    """``sap/Taxi-v0`` and ``Taxi-v4``: False where the state did not change.
 
     *Argument.* It ran into a wall, or there was nobody to pick up or to drop. The same state a step later, at a cost of
     1 or 10, is worth less than now: the label is sound.

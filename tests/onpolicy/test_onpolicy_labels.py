@@ -232,6 +232,21 @@ def test_loss_follows_the_agreement():
     assert right.logger.name_to_value["sap/permissibility_loss"] > 0
 
 
+class LabelsAtTimes(Line):
+    """A :class:`Line` that labels only every other step."""
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, (info if self.steps % 2 else {})
+
+
+def test_rollout_that_is_labelled_in_part_says_nothing_about_agreement():
+    settings = {"ap_function": None, "permissible_actions": lambda obs, actions: np.ones(len(actions), dtype=bool)}
+    model = build_on_policy(PPOAP, LabelsAtTimes(n_actions=3), permissibility_coef=1.0, **settings).learn(64)
+    assert sum(model.knowledge.seen) == 32
+    assert float(model.agreement) == 0
+
+
 def test_loss_of_finite_actions_is_that_of_the_permitted_probability():
     model = judged_by(
         lambda obs, actions: 0.5 - actions[:, 0],

@@ -123,8 +123,10 @@ def run_shortly(code, name, names, steps=300):
     """Runs code with its training cut short."""
     code, cuts = re.subn(r"\.learn\([\d_]+", f".learn({steps}", code)
     exec(compile(code.replace(", progress_bar=True", ""), name, "exec"), names)
-    # An on-policy algorithm completes its rollout.
-    assert cuts == 0 or names["model"].num_timesteps - steps in range(names["model"].n_steps)
+    if cuts:  # what was begun is completed: a rollout, or the steps before an update
+        model = names["model"]
+        begun = model.train_freq.frequency if hasattr(model, "train_freq") else model.n_steps
+        assert model.num_timesteps - steps in range(begun * model.n_envs)
     return cuts
 
 

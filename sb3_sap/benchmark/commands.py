@@ -29,6 +29,7 @@ REPORTS = {
     "headline": (["headline"], "the table of the README: S and laps after 250, 500, 1,000 and 3,000 steps"),
     "ablations": (["ablations"], "summary of DDPG-AP with one thing changed at a time"),
     "details": (["details"], "summary of details that the paper leaves open, one changed at a time"),
+    "readings": (["readings"], "summary of readings of how the paper fits its AP predictor"),
     "auxiliary": (["auxiliary"], "summary of how often the auxiliary actor loss is applied"),
     "robustness": (["robustness"], "summary at 80 km/h and from random starts, for which nothing was tuned"),
     "ways": (["ways"], "ways of using the label: none, as a reward penalty, a loss beside it, and guidance"),
@@ -36,7 +37,7 @@ REPORTS = {
     "wrong_labels": (["wrong_labels"], "the same for labels that are wrong"),
 }
 #: Reports that are summaries of other configurations.
-SUMMARIES = ("summary", "ablations", "details", "auxiliary", "robustness")
+SUMMARIES = ("summary", "ablations", "details", "readings", "auxiliary", "robustness")
 #: Reports that compare ways of using the label.
 WAYS = ("ways", "on_policy", "wrong_labels")
 #: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.

@@ -56,6 +56,17 @@ GROUPS: dict[str, list[str]] = {
             for configuration in changed
         ),
     ],
+    # How the paper may have fitted E: its λ as weight decay, without it or divided by N_E, and with Adam in place of SGD.
+    "readings": [
+        "ddpg:paper",
+        "ddpg_ap:paper",
+        *(f"ddpg_ap:paper[predictor_kwargs.weight_decay={decay}]" for decay in (0, 0.000005)),
+        *(
+            "ddpg_ap:paper[predictor_kwargs.optimizer_class=Adam,"
+            f"predictor_kwargs.weight_decay=0,predictor_kwargs.learning_rate={rate}]"
+            for rate in (0.01, 0.001)
+        ),
+    ],
     # The auxiliary actor loss after every actor update, or only as often as E is fitted and while guidance lasts.
     "auxiliary": [
         *("ddpg_ap:fast", "ddpg_ap:default[actor_permissibility_coef=1.0,refit_growth=0.005]", "ddpg:tuned"),

@@ -23,6 +23,7 @@ LAYERS = (
     {"onpolicy"},
     {"guidance", "check"},
     {"predictor"},
+    {"transitions"},
     {"permissibility"},
     {"common"},
 )

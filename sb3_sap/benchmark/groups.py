@@ -56,7 +56,7 @@ GROUPS: dict[str, list[str]] = {
             for configuration in changed
         ),
     ],
-    # How the paper may have fitted E: its λ as weight decay, without it or divided by N_E, and with Adam in place of SGD.
+    # How the paper may have fitted E: with its λ as weight decay, without it or divided by N_E, and with Adam.
     "readings": [
         "ddpg:paper",
         "ddpg_ap:paper",

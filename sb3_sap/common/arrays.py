@@ -30,6 +30,13 @@ def rows_of(obs: Any, rows: Any) -> Any:
     return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]
 
 
+def joined_rows(parts: list[Any]) -> Any:
+    """Several batches of observations in one; for a ``Dict`` space, one array per key."""
+    if isinstance(parts[0], dict):
+        return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return np.concatenate(parts)
+
+
 def stack_observations(observations: list[Any]) -> Any:
     """A batch of single observations; for a ``Dict`` space, one array per key."""
     if isinstance(observations[0], dict):

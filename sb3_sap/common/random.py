@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-Stream = Literal["exploration", "knowledge", "predictor"]
-_STREAMS: tuple[Stream, ...] = ("exploration", "knowledge", "predictor")
+Stream = Literal["exploration", "knowledge", "predictor", "prior"]
+_STREAMS: tuple[Stream, ...] = ("exploration", "knowledge", "predictor", "prior")
 
 
 def make_rng(seed: int | None, stream: Stream) -> np.random.Generator:

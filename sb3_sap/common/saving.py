@@ -67,6 +67,8 @@ class SavingMixin(BaseAlgorithm):
     ) -> Self:
         """SB3's ``load``, with a clear error for an unusable file; a ``seed`` among ``kwargs`` is applied."""
         known = inspect.signature(cls).parameters
+        if "predictor" in kwargs:
+            raise TypeError("`load` restores the AP predictor of the file: call `model.set_predictor(...)` afterwards.")
         for name in kwargs.keys() - known.keys():
             if near := difflib.get_close_matches(name, known, n=1, cutoff=0.75):
                 raise TypeError(f"`load` was given the unknown setting `{name}`: did you mean `{near[0]}`?")

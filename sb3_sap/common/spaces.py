@@ -81,6 +81,14 @@ def joint_actions(space: spaces.Space[Any]) -> np.ndarray[Any, Any]:
     return actions.reshape(-1, *(space.shape or ())).astype(space.dtype)
 
 
+def unscaled(action_space: spaces.Space[Any], action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Actions in the environment's units, of a ``Box`` from those scaled to [-1, 1]."""
+    if not isinstance(action_space, spaces.Box):
+        return action
+    low, high = action_space.low, action_space.high
+    return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
+
+
 def _hint(space: spaces.Space[Any]) -> str:
     if isinstance(space, spaces.Discrete):
         return "choose DQNAP or QRDQNAP"

@@ -35,14 +35,14 @@ from sb3_sap.predictor.building import make_knowledge
 from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import LabelledTransitions
-from sb3_sap.predictor.learned import LearnedPredictorMixin
 from sb3_sap.predictor.schedule import weighted_labels
+from sb3_sap.predictor.transfer import PriorKnowledgeMixin
 
 #: Maximum number of combinations of a MultiDiscrete or MultiBinary action, each of which E judges in each state.
 MOST_COMBINATIONS = 4_096
 
 
-class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAlgorithm):
+class OnPolicyPermissibilityMixin(PriorKnowledgeMixin, SavingMixin, OnPolicyAlgorithm):
     """Guides an SB3 on-policy algorithm with a learned AP predictor E.
 
     Goes before the algorithm in the bases of a class. E is fixed while a rollout is collected, and then fitted, in
@@ -54,7 +54,7 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
       (:meth:`~sb3_sap.onpolicy.guide.Guide.first_permissible`).
 
     Where E permits nothing everything is permitted. ``predict`` is the policy alone unless ``guided=True`` is passed.
-    The further parameters are those of :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin` and of the base
+    The further parameters are those of :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin` and of the base
     algorithm, whose ``learning_rate`` and ``clip_range`` may also be ``"lin_<number>"``. A recurrent policy has a
     memory; E sees the observation alone.
 
@@ -180,6 +180,9 @@ class OnPolicyPermissibilityMixin(LearnedPredictorMixin, SavingMixin, OnPolicyAl
 
     def _holds_knowledge(self) -> bool:
         return self.labelled is not None
+
+    def _label_holder(self) -> LabelledTransitions:
+        return self.labelled
 
     def set_random_seed(self, seed: int | None = None) -> None:
         super().set_random_seed(seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
@@ -12,10 +13,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
+from sb3_sap.common.spaces import unscaled
 from sb3_sap.common.vec_envs import environment_layout
 from sb3_sap.permissibility import APFunction, query_labels
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
-from sb3_sap.predictor.labelling import take_in, unscaled
+from sb3_sap.predictor.labelling import take_in
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -31,6 +33,12 @@ class KnowledgeMixin(ReplayBuffer):
     shaping: RewardShaping
     #: Whether a transition without a label is an error; otherwise it is not added to K.
     needs_labels: bool = True
+    #: Whether any stored reward differs from the environment's own.
+    rewards_are_shaped: bool = False
+    #: Transitions from elsewhere, in buffers of this kind.
+    prior: tuple[KnowledgeMixin, ...] = ()
+    #: The share of a batch that comes from `prior`.
+    prior_share: float = 0.5
 
     def __init__(
         self, *args: Any, knowledge: KnowledgeBuffer | None = None, ap_function: APFunction | None = None, **kwargs: Any
@@ -60,7 +68,24 @@ class KnowledgeMixin(ReplayBuffer):
         _, added = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
         if added is not None:
             reward = reward + added
+            self.rewards_are_shaped = True
         super().add(obs, next_obs, action, reward, done, infos)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
+        """SB3's ``sample``; of the batch, ``prior_share`` comes from `prior`, if it holds anything."""
+        if not self.prior:
+            return super().sample(batch_size, env)
+        older = round(batch_size * self.prior_share) if self._has_samples() else batch_size
+        sizes = np.array([buffer.size() for buffer in self.prior])
+        # From SB3's generator, as the rows within a buffer.
+        chosen = np.bincount(np.random.choice(len(sizes), older, p=sizes / sizes.sum()), minlength=len(sizes))  # noqa: NPY002
+        parts = [buffer.sample(int(n), env) for n, buffer in zip(chosen, self.prior, strict=True) if n > 0]
+        if older < batch_size:
+            parts.append(super().sample(batch_size - older, env))
+        return _joined(parts)
+
+    def _has_samples(self) -> bool:
+        return self.size() > 0
 
     def __getstate__(self) -> dict[str, Any]:
         # The user's functions belong to the model; the file holds only data.
@@ -84,6 +109,9 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
 
     A hindsight goal is labelled, penalised and shaped as if it had been pursued.
     """
+
+    def _has_samples(self) -> bool:
+        return bool((self.ep_length > 0).any())
 
     def _get_virtual_samples(
         self, batch_indices: np.ndarray[Any, Any], env_indices: np.ndarray[Any, Any], env: VecNormalize | None = None
@@ -117,6 +145,17 @@ GUIDED_BUFFERS: dict[type[ReplayBuffer], type[KnowledgeMixin]] = {
     NStepReplayBuffer: PermissibilityNStepReplayBuffer,
     HerReplayBuffer: PermissibilityHerReplayBuffer,
 }
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Several batches of a replay buffer in one."""
+
+    def join(values: Any) -> Any:
+        if isinstance(values[0], dict):
+            return {key: th.cat([value[key] for value in values]) for key in values[0]}
+        return None if values[0] is None else th.cat(values)
+
+    return type(parts[0])(*map(join, zip(*parts, strict=True)))
 
 
 def _normalized(buffer: ReplayBuffer, obs: dict[str, Any], env: VecNormalize | None) -> dict[str, Any]:

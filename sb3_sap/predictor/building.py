@@ -16,6 +16,7 @@ from sb3_sap.common.torch_utils import own_generators
 from sb3_sap.predictor.buffers import KnowledgeMixin, guided_buffer_class
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.network import PermissibilityPredictor
+from sb3_sap.predictor.optimizer_state import settings_of
 
 #: Arguments whose defaults are the policy's, so that E extracts features from observations as the policy does.
 SHARED = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
@@ -32,10 +33,13 @@ ARCHITECTURE = (
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
-def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[PermissibilityPredictor, dict[str, Any]]:
+def make_predictor(
+    model: Any, saved: Mapping[str, Any], given: PermissibilityPredictor | None = None
+) -> tuple[PermissibilityPredictor, dict[str, Any]]:
     """E with the model's ``predictor_kwargs``, and a description of its architecture.
 
     :param saved: the description of a saved predictor whose weights will be loaded; empty: there is none
+    :param given: a predictor whose weights and arguments it takes over, as far as ``predictor_kwargs`` say nothing else
     :raise TypeError: for unknown arguments
     :raise ValueError: for another architecture than the saved one
     """
@@ -44,6 +48,10 @@ def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[Permissibility
         own = {"features_extractor_kwargs": {}, **own}
     arguments = {name: getattr(model.policy, name) for name in SHARED} | own
     known = inspect.signature(PermissibilityPredictor).parameters
+    if given is not None:
+        taken = given._get_constructor_parameters()
+        arguments = {name: taken[name] for name in list(known)[2:]} | own
+        saved = {name: described(taken[name]) for name in ARCHITECTURE}
     for name in arguments.keys() - known.keys():
         raise TypeError(
             f"`predictor_kwargs` holds {name!r}, but PermissibilityPredictor takes {', '.join(list(known)[2:])}."
@@ -60,17 +68,25 @@ def make_predictor(model: Any, saved: Mapping[str, Any]) -> tuple[Permissibility
     with own_generators(int(make_rng(model.seed, "predictor").integers(2**31)), model.device):
         predictor = PermissibilityPredictor(model.observation_space, model.action_space, **arguments)
     predictor = predictor.to(model.device)
+    if given is not None:
+        predictor.load_state_dict(given.state_dict())
+        own_settings = settings_of(predictor.optimizer)
+        predictor.optimizer.load_state_dict(given.optimizer.state_dict())
+        for group, settings in zip(predictor.optimizer.param_groups, own_settings, strict=True):
+            group.update(settings)
+        predictor.about = given.about
+        return predictor, architecture
     # Some optimizers, such as Adagrad, have a state from the start; loading it moves it to the device of the weights.
     predictor.optimizer.load_state_dict(predictor.optimizer.state_dict())
     return predictor, architecture
 
 
-def make_knowledge(model: Any) -> KnowledgeBuffer:
+def make_knowledge(model: Any, kind: type[KnowledgeBuffer] = KnowledgeBuffer) -> KnowledgeBuffer:
     """An empty K of the model's size.
 
     :raise ValueError: if it has no room for ``min_per_class`` examples of each class
     """
-    knowledge = KnowledgeBuffer(
+    knowledge = kind(
         model.observation_space,
         int(np.prod(model.action_space.shape or (1,))),
         model.knowledge_buffer_size,
@@ -87,9 +103,10 @@ def make_knowledge(model: Any) -> KnowledgeBuffer:
     return knowledge
 
 
-def make_replay_buffer(model: Any) -> KnowledgeMixin:
+def make_replay_buffer(model: Any, rows: int | None = None) -> KnowledgeMixin:
     """An empty R that feeds an empty K, of the requested class or the one that SB3 would have chosen.
 
+    :param rows: a buffer for so many transitions from elsewhere instead, beside the model's own
     :raise ValueError: if the class does not fit the settings or the observations
     """
     buffer_class = guided_buffer_class(model.replay_buffer_class, model.observation_space, model.n_steps)
@@ -106,13 +123,13 @@ def make_replay_buffer(model: Any) -> KnowledgeMixin:
                 f"{model.observation_space}: leave it out, or use an environment with goals."
             )
     return buffer_class(
-        model.buffer_size,
+        model.buffer_size if rows is None else rows,
         model.observation_space,
         model.action_space,
         device=model.device,
-        n_envs=model.n_envs,
-        optimize_memory_usage=model.optimize_memory_usage,
-        knowledge=make_knowledge(model),
+        n_envs=model.n_envs if rows is None else 1,
+        optimize_memory_usage=model.optimize_memory_usage and rows is None,
+        knowledge=make_knowledge(model) if rows is None else model.knowledge,
         **kwargs,
     )
 

@@ -55,6 +55,8 @@ class PermissibilityCallback(BaseCallback):
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)
+        if knowledge.newest is not None:
+            self.model.test_familiarity()
         if not getattr(self.model, "fits_in_train", False):
             n_envs = self.model.n_envs
             due = self.model.refits_due(self._start // n_envs, self.model.lifetime_steps // n_envs)
@@ -62,10 +64,12 @@ class PermissibilityCallback(BaseCallback):
 
     def refit(self, n: int) -> None:
         """Fits E ``n`` times, if K holds enough examples, and validates it once."""
-        if min(self.knowledge.counts("train")) >= self.model.min_per_class:
+        if self.model.freeze_predictor:
+            n = 0
+        if self.knowledge.holds("train", self.model.min_per_class):
             for _ in range(n):
                 self.fit()
-        if n > 0 and self.model.predictor.fitted and min(self.knowledge.counts("validation")) > 0:
+        if n > 0 and self.model.predictor.fitted and self.knowledge.holds("validation", 1):
             self.validate()
 
     def fit(self) -> None:

@@ -11,17 +11,18 @@ from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_sap.common.arrays import FloatArray, Observations
+from sb3_sap.common.arrays import FloatArray, Observations, copy_observation, joined_rows, rows_of
 from sb3_sap.common.errors import is_number
 from sb3_sap.common.files import atomic_path
 from sb3_sap.common.random import make_rng
-from sb3_sap.predictor.slots import ClassSlots
+from sb3_sap.predictor.slots import ClassSlots, Reservoir
 
 NON_PERMISSIBLE, PERMISSIBLE = 0, 1
 CLASSES = (NON_PERMISSIBLE, PERMISSIBLE)
 #: Maximum number of observations among which the typical one is sought.
 TYPICAL = 1_000
 Part = Literal["train", "validation"]
+PARTS: tuple[Part, Part] = ("train", "validation")
 
 
 class LabelledActions(NamedTuple):
@@ -37,6 +38,8 @@ class KnowledgeBuffer:
 
     Observations are kept raw, as SB3's replay buffer keeps them, and normalised when sampled.
 
+    What is known from elsewhere is held apart, in `prior`, and makes up ``prior_share`` of each sample.
+
     :param observation_space: of the environment
     :param action_dim: length of one stored action
     :param size: capacity; the paper's is 10,000
@@ -44,6 +47,15 @@ class KnowledgeBuffer:
     :param seed: of the generator that splits and samples
     :param min_per_class: tuples of each class, in each part, for which a full K makes room at the other class's cost
     """
+
+    #: Tuples of each class that a part must have before it is used beside `prior`.
+    min_per_class: int = 1
+    #: What is known from elsewhere; None: nothing.
+    prior: PriorKnowledge | None = None
+    #: The share of a sample that comes from `prior`, once there are enough own tuples of both classes.
+    prior_share: float = 0.5
+    #: The newest labelled actions, for whoever tests E on them before it learns from them; None: nobody does.
+    newest: list[tuple[Observations, np.ndarray[Any, Any], np.ndarray[Any, Any]]] | None = None
 
     def __init__(
         self,
@@ -63,11 +75,14 @@ class KnowledgeBuffer:
                 "for both classes in each part: both the training and the validation part need at least 2 places."
             )
         self.size = size
+        self.min_per_class = min_per_class
         self.validation_fraction = validation_fraction
         self.seed(seed)
         self.seen = [0, 0]  # (non-permissible, permissible) tuples ever added
         capacities = {"train": size - n_validation, "validation": n_validation}
-        self.parts = {part: ClassSlots(capacity, min_per_class) for part, capacity in capacities.items()}
+        self.parts: dict[str, Any] = {
+            part: ClassSlots(capacity, min_per_class) for part, capacity in capacities.items()
+        }
         # The validation part lies behind the training part in the same arrays.
         self._offset = {"train": 0, "validation": size - n_validation}
         self._keyed = isinstance(observation_space, spaces.Dict)
@@ -81,7 +96,7 @@ class KnowledgeBuffer:
         return sum(len(part) for part in self.parts.values())
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickle: of the arrays only the filled rows, which come first in each part."""
+        """For pickle: of the arrays only the filled rows."""
         filled = self._filled()
         rows = {key: store[filled] for key, store in self.observations.items()}
         return {**vars(self), "observations": rows, "actions": self.actions[filled]}
@@ -115,8 +130,8 @@ class KnowledgeBuffer:
 
     def _filled(self) -> np.ndarray[Any, np.dtype[np.int64]]:
         """The rows that hold a tuple."""
-        parts: tuple[Part, Part] = ("train", "validation")
-        return np.concatenate([self._offset[part] + np.arange(len(self.parts[part])) for part in parts])
+        kept = [self._offset[part] + self.parts[part].slots(label) for part in PARTS for label in CLASSES]
+        return np.sort(np.concatenate(kept))
 
     def seed(self, seed: int | None) -> None:
         """Restarts the generator that splits and samples."""
@@ -134,6 +149,8 @@ class KnowledgeBuffer:
         :param actions: (n, action_dim), scaled
         :param labels: (n,) bool
         """
+        if self.newest is not None:
+            self.newest.append((copy_observation(obs), actions.copy(), labels))
         keyed = obs if isinstance(obs, dict) else {"": obs}
         for i, label in enumerate(labels):
             part: Part = "validation" if self.rng.random() < self.validation_fraction else "train"
@@ -142,6 +159,11 @@ class KnowledgeBuffer:
                 store[slot] = keyed[key][i]
             self.actions[slot] = actions[i]
             self.seen[int(label)] += 1
+
+    def holds(self, part: Part, n: int) -> bool:
+        """Whether a part, or that of `prior`, has n tuples of each class."""
+        own = min(self.counts(part)) >= n
+        return own or (self.prior is not None and self.prior.holds(part, n))
 
     def training_observations(self) -> dict[str, np.ndarray[Any, Any]]:
         """The raw observations of the training part, (n, *obs_shape) for each key; an array's key is ``""``."""
@@ -176,6 +198,29 @@ class KnowledgeBuffer:
         :param env: normalises the observations, if given
         :param balanced: False draws every tuple with the same probability
         """
+        from_prior = self._from_prior(n, part)
+        if from_prior == 0:
+            return self.sample_own(n, part, env, balanced)
+        assert self.prior is not None
+        older = self.prior.sample_own(from_prior, part, env, balanced)
+        if from_prior >= 2 * (n // 2):
+            return older
+        newer = self.sample_own(n - from_prior, part, env, balanced)
+        order = self.rng.permutation(len(older.labels) + len(newer.labels))
+        joined = [rows_of(joined_rows([old, new]), order) for old, new in zip(older, newer, strict=True)]
+        return LabelledActions(*joined)
+
+    def _from_prior(self, n: int, part: Part) -> int:
+        """How many of n rows come from `prior`, an even number."""
+        if self.prior is None or not self.prior.holds(part, 1):
+            return 0
+        enough = min(self.counts(part)) >= self.min_per_class
+        return 2 * round(n // 2 * (self.prior_share if enough else 1.0))
+
+    def sample_own(
+        self, n: int, part: Part = "train", env: VecNormalize | None = None, balanced: bool = True
+    ) -> LabelledActions:
+        """The same without `prior`."""
         n_permissible = n // 2
         if not balanced:
             n_permissible = int(self.rng.binomial(2 * (n // 2), self.counts(part)[PERMISSIBLE] / len(self.parts[part])))
@@ -188,3 +233,30 @@ class KnowledgeBuffer:
         rows = {key: store[slots] for key, store in self.observations.items()}
         obs: Observations = rows if self._keyed else rows[""]
         return LabelledActions(obs if env is None else env.normalize_obs(obs), self.actions[slots], labels)
+
+
+class PriorKnowledge(KnowledgeBuffer):
+    """What is known from elsewhere: a balanced random sample of all labelled actions that it was ever given.
+
+    The parameters are those of :class:`KnowledgeBuffer`. Half of each part is for each class.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.parts = {name: Reservoir(part.capacity) for name, part in self.parts.items()}
+
+    def seed(self, seed: int | None) -> None:
+        self.rng = make_rng(seed, "prior")
+
+    def add(self, obs: Observations, actions: np.ndarray[Any, Any], labels: np.ndarray[Any, Any]) -> None:
+        keyed = obs if isinstance(obs, dict) else {"": obs}
+        validates = self.rng.random(len(labels)) < self.validation_fraction
+        for part in PARTS:
+            for label in CLASSES:
+                rows = np.flatnonzero((labels == label) & (validates == (part == "validation")))
+                kept, slots = self.parts[part].claim(label, len(rows), self.rng)
+                slots = self._offset[part] + slots
+                for key, store in self.observations.items():
+                    store[slots] = keyed[key][rows[kept]]
+                self.actions[slots] = actions[rows[kept]]
+                self.seen[label] += len(rows)

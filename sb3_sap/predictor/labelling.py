@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from sb3_sap.common.arrays import BoolArray, FloatArray
 from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
+from sb3_sap.common.spaces import unscaled
 from sb3_sap.common.vec_envs import RAW_LAST, environment_layout
 from sb3_sap.permissibility import APFunction, labels_from_infos, query_labels
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
@@ -87,14 +88,6 @@ def take_in(
     truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
     terminal = np.asarray(done, dtype=bool) & ~truncated
     return labels, holder.shaping.difference(labels, before, after, terminal, float(holder.reward_scale))
-
-
-def unscaled(action_space: spaces.Space[Any], action: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Actions in the environment's units, of a ``Box`` from those scaled to [-1, 1]."""
-    if not isinstance(action_space, spaces.Box):
-        return action
-    low, high = action_space.low, action_space.high
-    return np.asarray(low + 0.5 * (action + 1.0) * (high - low))
 
 
 def set_row(observations: Any, row: int, obs: Any) -> None:

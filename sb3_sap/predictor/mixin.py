@@ -16,15 +16,17 @@ from sb3_sap.predictor.building import make_replay_buffer
 from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permissibility_callback
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import Labels
-from sb3_sap.predictor.learned import LearnedPredictorMixin
+from sb3_sap.predictor.prior_replay import PriorReplay
 from sb3_sap.predictor.schedule import check_growth, due
+from sb3_sap.predictor.transfer import Into, PriorKnowledgeMixin
+from sb3_sap.transitions.sources import number_of_rows
 
 
-class LearnedPermissibilityMixin(LearnedPredictorMixin, SettingsMixin):
+class LearnedPermissibilityMixin(PriorKnowledgeMixin, SettingsMixin):
     """Gives an SB3 off-policy algorithm a knowledge buffer K and an AP predictor E (section 4.2).
 
     Only trains the predictor; action selection and policy updates are those of the base algorithm.
-    The further parameters are those of :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin`.
+    The further parameters are those of :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin`.
 
     :param refit_growth: refit and validate E when the step count has grown by this fraction, because a few new
         examples change it less and less, while a fit costs the same; 0 (paper): every step, or as often as
@@ -69,8 +71,21 @@ class LearnedPermissibilityMixin(LearnedPredictorMixin, SettingsMixin):
     def _holds_knowledge(self) -> bool:
         return isinstance(self.replay_buffer, KnowledgeMixin)
 
+    def _label_holder(self) -> Labels:
+        return cast(KnowledgeMixin, self.replay_buffer)
+
+    def _new_replay(self, into: Into | None, source: Any) -> PriorReplay | None:
+        if into == "knowledge":
+            return None
+        return PriorReplay(self, into is not None, number_of_rows(source))
+
     def _set_label_source(self, holder: Labels) -> None:
         super()._set_label_source(holder)
+        for buffer in getattr(holder, "prior", ()):
+            super()._set_label_source(buffer)
+            buffer.reward_scale = holder.reward_scale
+            if isinstance(buffer, HerReplayBuffer) and buffer.env is None and self.env is not None:
+                buffer.set_env(self.env)
         if holder.shaping.penalises and holder.ap_function is None and isinstance(holder, HerReplayBuffer):
             raise ValueError(
                 f"`penalty` = {self.penalty!r} needs an `ap_function` beside {type(holder).__name__}, for a hindsight "

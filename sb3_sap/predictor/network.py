@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral, Real
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import torch as th
@@ -17,9 +18,11 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_sap.common.arrays import FloatArray
+from sb3_sap.common.arrays import FloatArray, Observations
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
+from sb3_sap.common.vec_envs import policy_layout
 from sb3_sap.predictor.knowledge import LabelledActions
+from sb3_sap.predictor.weights import read_predictor, write_predictor
 
 #: Balanced validation accuracy from which E is accurate enough for α; below it, ``alpha_low`` holds (section 4.3).
 SUFFICIENT_ACCURACY = 0.7
@@ -103,6 +106,8 @@ class PermissibilityPredictor(BaseModel):
             weight_decay=weight_decay,
             **self.optimizer_kwargs,
         )
+        #: What is known of its fit: balanced "accuracy", and "statistics" of the observations' normalisation.
+        self.about: dict[str, Any] = {}
         # Only a fit needs training mode; everything else queries E, sometimes for a single state.
         self.set_training_mode(False)
 
@@ -116,6 +121,35 @@ class PermissibilityPredictor(BaseModel):
             "features_extractor_class": self.features_extractor_class,
             "features_extractor_kwargs": self.features_extractor_kwargs,
         }
+
+    def save(self, path: str | Path) -> None:
+        """Writes weights, architecture and spaces as plain data."""
+        write_predictor(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, device: th.device | str = "auto", **arguments: Any) -> Self:
+        """Reads what :meth:`save` wrote. Nothing in the file is executed, so that it may come from a stranger.
+
+        :param arguments: of the constructor, in place of those in the file: a ``features_extractor_class``,
+            ``activation_fn`` or ``optimizer_class`` of your own must be passed
+        :raise ValueError: with one sentence, if the file holds no predictor
+        """
+        return read_predictor(cls, path, device, **arguments)  # type: ignore[no-any-return]
+
+    def probabilities(self, obs: Observations, actions: np.ndarray[Any, Any]) -> FloatArray:
+        """(n,) probabilities that n actions are permissible.
+
+        :param obs: (n, *obs_shape), as the policy gets them: normalised if it learned so
+        :param actions: (n, *action_shape), in the environment's units
+        """
+        scaled = np.asarray(actions)
+        if isinstance(self.action_space, spaces.Box):
+            low, high = self.action_space.low, self.action_space.high
+            scaled = 2.0 * (scaled - low) / (high - low) - 1.0
+        with th.no_grad():
+            tensor = th.as_tensor(scaled.reshape(len(scaled), -1), device=self.device)
+            logits = self(obs_as_tensor(policy_layout(obs, self.observation_space), self.device), tensor)
+        return th.sigmoid(logits).cpu().numpy()
 
     @property
     def fitted(self) -> bool:

@@ -53,3 +53,37 @@ class ClassSlots:
         self._slots[label, : self.counts[label]] = in_age_order[1:]
         self._oldest[label] = 0
         return int(in_age_order[0])
+
+
+class Reservoir:
+    """Slots of two classes, half of the store for each, that hold a random sample of all tuples ever offered.
+
+    Every tuple of a class is among those kept with the same probability (Vitter 1985, algorithm R).
+
+    :param capacity: number of slots
+    """
+
+    def __init__(self, capacity: int):
+        self.capacity = capacity
+        self.quota = capacity // 2
+        self.offered = [0, 0]
+
+    @property
+    def counts(self) -> list[int]:
+        """The number of tuples kept of each class."""
+        return [min(self.quota, offered) for offered in self.offered]
+
+    def __len__(self) -> int:
+        return sum(self.counts)
+
+    def slots(self, label: int) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """The slots that hold a tuple of class ``label``."""
+        return label * self.quota + np.arange(self.counts[label])
+
+    def claim(self, label: int, n: int, rng: np.random.Generator) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+        """Which of n new tuples of class ``label`` are kept, and the slots of those, where a later one goes first."""
+        numbers = self.offered[label] + np.arange(n)
+        places = np.where(numbers < self.quota, numbers, rng.integers(0, numbers + 1))
+        kept = np.flatnonzero(places < self.quota)
+        self.offered[label] += n
+        return kept, label * self.quota + places[kept]

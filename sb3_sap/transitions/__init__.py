@@ -1,0 +1,1 @@
+"""Transitions from elsewhere: arrays, replay buffers, trajectories, data sets and tables."""

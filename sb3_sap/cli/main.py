@@ -16,6 +16,7 @@ from sb3_sap.cli.compare import add_compare
 from sb3_sap.cli.demo import add_demo
 from sb3_sap.cli.evaluate import add_evaluate
 from sb3_sap.cli.hub import add_push_to_hub
+from sb3_sap.cli.predictor import add_predictor
 from sb3_sap.cli.torcs import add_torcs
 from sb3_sap.common.command_line import run_command
 
@@ -46,6 +47,7 @@ def parser() -> argparse.ArgumentParser:
     add_demo(commands)
     add_compare(commands)
     add_evaluate(commands)
+    add_predictor(commands)
     add_benchmark(commands)
     add_torcs(commands)
     add_push_to_hub(commands)

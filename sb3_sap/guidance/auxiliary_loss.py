@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional as F
 
 from sb3_sap.common.torch_utils import flush_denormals
@@ -15,31 +13,38 @@ from sb3_sap.predictor.network import PermissibilityPredictor
 
 
 @flush_denormals()
-def permissible_actor_step(
-    actor: Any,
-    predictor: PermissibilityPredictor,
-    replay_buffer: ReplayBuffer,
-    coef: float,
-    batch_size: int,
-    env: VecNormalize | None = None,
-) -> float:
+def permissible_actor_step(actor: Any, predictor: PermissibilityPredictor, observations: Any, coef: float) -> float:
     """One gradient step of the actor on β · softplus(−E(s, μ(s))), E itself held fixed.
 
     This is the cross-entropy of the actor's own action under the predictor, had it been labelled permissible. An
     optimal action is permissible by Definition 3, so under a perfect E the term vanishes at the optimum.
 
     :param actor: with its ``optimizer``; the mean action of a stochastic one is used, so that its entropy is unaffected
+    :param observations: n observation tensors
     :param coef: β
-    :param batch_size: states drawn from the replay buffer
-    :param env: normalises the states, if given
     :return: the loss before the step
     """
-    observations = replay_buffer.sample(batch_size, env=env).observations
     loss = coef * F.softplus(-predictor(observations, mean_action(actor, observations))).mean()
     actor.optimizer.zero_grad()
     trained = [parameter for parameter in actor.parameters() if parameter.requires_grad]  # some may be frozen
     if trained:
         loss.backward(inputs=trained)  # type: ignore[no-untyped-call]
+    actor.optimizer.step()
+    return loss.item()
+
+
+@flush_denormals()
+def cloning_step(actor: Any, observations: Any, actions: th.Tensor) -> float:
+    """One gradient step of the actor on its mean squared distance from given actions.
+
+    :param actor: with its ``optimizer``; a stochastic one moves its mean
+    :param observations: n observation tensors
+    :param actions: (n, action_dim), scaled
+    :return: the loss before the step
+    """
+    loss = F.mse_loss(mean_action(actor, observations), actions)
+    actor.optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
     actor.optimizer.step()
     return loss.item()
 
@@ -54,20 +59,13 @@ def mean_action(actor: Any, observations: Any) -> th.Tensor:
 
 
 @flush_denormals()
-def permissible_value_step(
-    model: Any,
-    predictor: PermissibilityPredictor,
-    replay_buffer: ReplayBuffer,
-    coef: float,
-    batch_size: int,
-    env: VecNormalize | None = None,
-) -> float:
+def permissible_value_step(model: Any, predictor: PermissibilityPredictor, observations: Any, coef: float) -> float:
     """One gradient step of the Q-values on β times :func:`preference_loss`.
 
     :param model: DQN or QR-DQN
+    :param observations: n observation tensors
     :return: the loss before the step; 0 if in no state E rejects some actions and permits others
     """
-    observations = replay_buffer.sample(batch_size, env=env).observations
     loss = coef * preference_loss(model, predictor, observations)
     if not loss.requires_grad:
         return 0.0

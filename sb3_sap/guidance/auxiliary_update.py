@@ -5,13 +5,17 @@ from __future__ import annotations
 from numbers import Real
 from typing import Any, cast
 
+import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
+from sb3_sap.common.arrays import rows_of
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
-from sb3_sap.guidance.auxiliary_loss import permissible_actor_step, permissible_value_step
+from sb3_sap.guidance.auxiliary_loss import cloning_step, permissible_actor_step, permissible_value_step
+from sb3_sap.predictor.knowledge import PERMISSIBLE
 from sb3_sap.predictor.schedule import check_growth, due
 
 #: After guidance ends, refit the predictor only every n-th time.
@@ -19,6 +23,9 @@ FITS_AFTER_GUIDANCE = 5
 #: Maximum number of timesteps between two fits while the auxiliary loss has a schedule of its own: a stale classifier
 #: biases the actor.
 STEPS_BETWEEN_FITS = 15
+
+#: Networks of the policy, and those of the target that follow them.
+TARGETS = (("actor", "actor_target"), ("q_net", "q_net_target"), ("quantile_net", "quantile_net_target"))
 
 
 class AuxiliaryLossMixin(GuidedExplorationMixin):
@@ -70,7 +77,6 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
         if coef == 0 or self.predictor_idle or not self.predictor_accurate:
             return
-        step = permissible_value_step if self.discrete else permissible_actor_step
         if self.teaching_growth is None:
             updates = due(self.refit_growth, before, self._n_updates)
         else:
@@ -78,12 +84,40 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
             delay = getattr(self, "policy_delay", 1)
             updates = due(self.teaching_growth, before // delay, self._n_updates // delay)
         for _ in range(updates):
-            loss = step(
-                self if self.discrete else self.actor,
-                self.predictor,
-                cast(ReplayBuffer, self.replay_buffer),
-                coef,
-                self.predictor.batch_size,  # as many states as one gradient step of E
-                self._vec_normalize_env,
-            )
-            self.logger.record_mean("sap/auxiliary_loss", loss)
+            # As many states as one gradient step of E.
+            batch = cast(ReplayBuffer, self.replay_buffer).sample(self.predictor.batch_size, self._vec_normalize_env)
+            self.logger.record_mean("sap/auxiliary_loss", self._permissible_step(batch.observations, coef))
+
+    def _permissible_step(self, observations: Any, coef: float) -> float:
+        step = permissible_value_step if self.discrete else permissible_actor_step
+        return step(self if self.discrete else self.actor, self.predictor, observations, coef)
+
+    def teach_policy(self, steps: int = 1_000) -> float:
+        """Teaches the policy what is permissible, before the first step, from the actions that are known.
+
+        These are what :meth:`add_knowledge` kept, or else K. A continuous actor regresses on those that are labelled
+        permissible; the values of discrete actions learn to prefer what E permits
+        (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`). Target networks follow.
+
+        :param steps: gradient steps
+        :return: the mean loss of the last tenth of them
+        :raise ValueError: if no permissible action is known, or for discrete actions if E was not fitted
+        """
+        source = self.knowledge.prior or self.knowledge
+        if source.counts("train")[PERMISSIBLE] == 0 or (self.discrete and not self.predictor.fitted):
+            missing = "E is not fitted: call `fit_predictor` first" if len(source) else "nothing is known"
+            raise ValueError(f"The policy cannot be taught, because {missing}.")
+        losses = []
+        for _ in range(steps):
+            sample = source.sample_own(2 * self.predictor.batch_size, "train", self.get_vec_normalize_env())
+            obs: Any = obs_as_tensor(cast(Any, sample.observations), self.device)
+            if self.discrete:
+                losses.append(self._permissible_step(obs, 1.0))
+            else:
+                good = np.flatnonzero(sample.labels)
+                actions = th.as_tensor(sample.actions[good], device=self.device)
+                losses.append(cloning_step(self.actor, rows_of(obs, good), actions))
+        for own, target in TARGETS:
+            if getattr(self, own, None) is not None and getattr(self, target, None) is not None:
+                getattr(self, target).load_state_dict(getattr(self, own).state_dict())
+        return float(np.mean(losses[-max(1, steps // 10) :]))

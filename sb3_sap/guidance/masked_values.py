@@ -13,12 +13,12 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_sap.common.arrays import BoolArray
-from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.common.vec_envs import environment_layout
+from sb3_sap.guidance.jump_start import JumpStartMixin
 from sb3_sap.guidance.masks import PermissibleActions, masks_at, masks_of
 
 
-class MaskedValuesMixin(SettingsMixin):
+class MaskedValuesMixin(JumpStartMixin):
     """Chooses the best of the actions that ``permissible_actions`` allows, in acting and in the target of the update.
 
     For algorithms of discrete actions; others are left as they are. Where nothing is allowed, everything is.

@@ -20,10 +20,12 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
         AuxiliaryLossMixin           the same with updates of its own
         GuidedExplorationMixin       Algorithm 1
         LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E
+        PriorKnowledgeMixin          transitions and predictors of elsewhere
         LearnedPredictorMixin        settings of K and E, saving of E
         WatchedEnvironmentMixin      raw last observations, warnings about the training environment
         ConstrainedExplorationMixin  constraints and permissible actions
         MaskedValuesMixin            masks of discrete actions
+        JumpStartMixin               a guide that acts at first
         SettingsMixin                settings that SB3 lacks
         EnvironmentMixin             spaces, wrappers, layouts
         SavingMixin                  what a file holds
@@ -36,8 +38,10 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
     :class:`~sb3_sap.guidance.permissibility_loss.PermissibilityLossMixin`,
     :class:`~sb3_sap.guidance.auxiliary_update.AuxiliaryLossMixin`,
     :class:`~sb3_sap.predictor.mixin.LearnedPermissibilityMixin`,
+    :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin`,
     :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin`,
-    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin` and
+    :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`,
+    :class:`~sb3_sap.guidance.jump_start.JumpStartMixin` and
     :class:`~sb3_sap.common.settings.SettingsMixin`, beside those of the base algorithm.
     """
 

@@ -49,9 +49,8 @@ def make_predictor(
     arguments = {name: getattr(model.policy, name) for name in SHARED} | own
     known = inspect.signature(PermissibilityPredictor).parameters
     if given is not None:
-        taken = given._get_constructor_parameters()
-        arguments = {name: taken[name] for name in list(known)[2:]} | own
-        saved = {name: described(taken[name]) for name in ARCHITECTURE}
+        arguments = given.arguments | own
+        saved = {name: described(given.arguments[name]) for name in ARCHITECTURE}
     for name in arguments.keys() - known.keys():
         raise TypeError(
             f"`predictor_kwargs` holds {name!r}, but PermissibilityPredictor takes {', '.join(list(known)[2:])}."

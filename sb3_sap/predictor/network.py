@@ -152,6 +152,12 @@ class PermissibilityPredictor(BaseModel):
         return th.sigmoid(logits).cpu().numpy()
 
     @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor but the spaces."""
+        found = self._get_constructor_parameters()
+        return {name: value for name, value in found.items() if not name.endswith("_space")}
+
+    @property
     def fitted(self) -> bool:
         """Whether E has seen any example; Algorithm 1 does not query it before."""
         return bool(self.n_updates)

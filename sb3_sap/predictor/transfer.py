@@ -86,6 +86,8 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                 )
         check_statistics(predictor.about.get("statistics"), self.get_vec_normalize_env())
         self.predictor, self._predictor_architecture = make_predictor(self, {}, predictor)
+        # `load` builds the same predictor.
+        self.predictor_kwargs = {**self.predictor.arguments, **(self.predictor_kwargs or {})}
         self.validation_accuracy = float(predictor.about.get("accuracy", float("nan")))
         if self.predictor.fitted:
             self._expect_familiarity()
@@ -127,7 +129,7 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
             labels = self._labels(holder, whole, sound, images, into)
             scaled = self._scaled(whole.actions)
             if labels is not None and into != "replay":
-                prior.add(_rows(whole.obs, sound), scaled[sound].reshape(int(sound.sum()), -1), labels[sound])
+                prior.add(_rows(whole.obs, sound), scaled.reshape(len(batch), -1)[sound], labels[sound])
             if labels is not None:
                 counts.update(labels[sound].tolist())
             else:
@@ -188,7 +190,8 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         if self.familiarity is None or not newest:
             return
         normalize = self.get_vec_normalize_env()
-        if self.predictor.fitted:
+        # One that does not even predict what it came from proves nothing.
+        if self.predictor.fitted and self.predictor_accurate:
             for raw, actions, labels in newest:
                 obs, _ = self.policy.obs_to_tensor(raw if normalize is None else normalize.normalize_obs(raw))
                 logits = self.predictor(obs, th.as_tensor(actions, device=self.device))

@@ -23,6 +23,10 @@ def weights(module):
     return {name: value.clone() for name, value in module.state_dict().items()}
 
 
+def states(model, n):
+    return model.replay_buffer.sample(n).observations
+
+
 def same(one, other):
     return all(th.equal(value, other[name]) for name, value in one.items())
 
@@ -39,7 +43,7 @@ def test_actor_step_follows_the_gradient_of_the_cross_entropy():
     )
     gradients = th.autograd.grad(expected, list(model.actor.parameters()))
     set_random_seed(0)
-    loss = permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=2.0, batch_size=8)
+    loss = permissible_actor_step(model.actor, model.predictor, states(model, 8), 2.0)
     assert loss == pytest.approx(expected.item())
     for (name, parameter), gradient in zip(model.actor.named_parameters(), gradients, strict=True):
         th.testing.assert_close(parameter, before[name] - 0.5 * gradient)
@@ -51,7 +55,7 @@ def test_actor_step_changes_the_actor_only(algorithm):
     predictor, critic, actor = weights(model.predictor), weights(model.critic), weights(model.actor)
     gradients = {name: parameter.grad.clone() for name, parameter in model.predictor.named_parameters()}
     model.policy.set_training_mode(True)
-    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    permissible_actor_step(model.actor, model.predictor, states(model, 8), 1.0)
     assert same(weights(model.predictor), predictor)
     assert same(gradients, {name: parameter.grad for name, parameter in model.predictor.named_parameters()})
     assert same(weights(model.critic), critic)
@@ -63,14 +67,14 @@ def test_actor_step_leaves_running_statistics_unchanged():
     before = {name: value.clone() for name, value in model.actor.named_buffers()}
     assert before
     model.policy.set_training_mode(True)
-    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    permissible_actor_step(model.actor, model.predictor, states(model, 8), 1.0)
     assert same(dict(model.actor.named_buffers()), before)
 
 
 def test_actor_step_leaves_the_standard_deviation_of_a_stochastic_policy_unchanged():
     model = build(SACAP).learn(60)
     before = weights(model.actor.log_std)
-    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    permissible_actor_step(model.actor, model.predictor, states(model, 8), 1.0)
     assert same(weights(model.actor.log_std), before)
 
 
@@ -80,7 +84,7 @@ def test_actor_steps_lead_to_actions_that_are_predicted_permissible(algorithm):
     model = build(algorithm, learning_starts=400, learning_rate=0.01, **WIDE).learn(400)
     assert model.validation_accuracy > 0.7
     for _ in range(200):
-        permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=32)
+        permissible_actor_step(model.actor, model.predictor, states(model, 32), 1.0)
     rows = np.array([[-0.8, 0.5], [-0.4, 0.5], [0.4, 0.5], [0.8, 0.5]], dtype=np.float32)
     assert np.array_equal(np.sign(mean_action(model, rows)[:, 0]), [1, 1, -1, -1])
 
@@ -192,7 +196,7 @@ def test_value_step_moves_rejected_values_below_the_best_permitted_value(algorit
     expected = 2.0 * th.log1p(th.exp(excess)).mean()
     gradients = th.autograd.grad(expected, list(net.parameters()))
     set_random_seed(0)
-    loss = permissible_value_step(model, Permits(1, 2), model.replay_buffer, coef=2.0, batch_size=32)
+    loss = permissible_value_step(model, Permits(1, 2), states(model, 32), 2.0)
     assert loss == pytest.approx(expected.item(), rel=1e-5)
     for (name, parameter), gradient in zip(net.named_parameters(), gradients, strict=True):
         th.testing.assert_close(parameter, before[name] - 0.5 * gradient)
@@ -205,7 +209,7 @@ def test_value_step_moves_rejected_values_below_the_best_permitted_value(algorit
 def test_value_step_changes_nothing_if_all_or_no_actions_are_permitted(permitted):
     model = discrete(DQNAP)
     before = weights(model.policy)
-    assert permissible_value_step(model, Permits(*permitted), model.replay_buffer, coef=1.0, batch_size=32) == 0.0
+    assert permissible_value_step(model, Permits(*permitted), states(model, 32), 1.0) == 0.0
     assert same(weights(model.policy), before)
 
 
@@ -215,7 +219,7 @@ def test_value_steps_lead_to_greedy_actions_that_are_predicted_permissible(algor
     model = build(algorithm, Line(n_actions=2), **settings).learn(400)
     assert model.validation_accuracy > 0.7
     for _ in range(200):
-        permissible_value_step(model, model.predictor, model.replay_buffer, coef=1.0, batch_size=32)
+        permissible_value_step(model, model.predictor, states(model, 32), 1.0)
     rows = np.array([[-0.8, 0.5], [-0.4, 0.5], [0.4, 0.5], [0.8, 0.5]], dtype=np.float32)
     assert model.predict(rows, deterministic=True)[0].tolist() == [1, 1, 0, 0]
 
@@ -255,5 +259,5 @@ def test_fully_frozen_actor_remains_unchanged():
     model = build(DDPGAP).learn(30)
     model.actor.requires_grad_(False)
     before = weights(model.actor)
-    permissible_actor_step(model.actor, model.predictor, model.replay_buffer, coef=1.0, batch_size=8)
+    permissible_actor_step(model.actor, model.predictor, states(model, 8), 1.0)
     assert same(before, weights(model.actor))

@@ -27,7 +27,7 @@ def episodes(n=3, horizon=10):
         observations, actions, rewards = [env.reset(seed=episode)[0]], [], []
         for _ in range(horizon):
             actions.append(env.action_space.sample())
-            obs, reward, terminated, truncated, _ = env.step(actions[-1])
+            obs, reward, terminated, _, _ = env.step(actions[-1])
             observations.append(obs)
             rewards.append(reward)
         yield np.array(observations), np.array(actions), np.array(rewards), terminated
@@ -111,7 +111,10 @@ def test_folder_of_imitation(tmp_path):
         for obs, acts, rews, end in episodes()
     ]
     table = pa.Table.from_pylist(rows)
-    with pa.OSFile(str(tmp_path / "data-00000-of-00001.arrow"), "wb") as sink, pa.ipc.new_stream(sink, table.schema) as w:
+    with (
+        pa.OSFile(str(tmp_path / "data-00000-of-00001.arrow"), "wb") as sink,
+        pa.ipc.new_stream(sink, table.schema) as w,
+    ):
         w.write_table(table)
     check(whole(tmp_path))
 

@@ -25,7 +25,7 @@ A model file holds pickled objects: loading one runs its code. Load only what yo
 
 ```python
 {use}
-```
+```{predictor}
 
 ## How it was made
 
@@ -35,6 +35,19 @@ A model file holds pickled objects: loading one runs its code. Load only what yo
 
 with sb3_sap {version} and Stable-Baselines3 {sb3_version}.
 """
+#: The AP predictor has a file of its own, which holds no code.
+PREDICTOR = """
+
+The AP predictor alone judges actions, or begins the training of any other algorithm (`predictor=`). Its file holds no
+code:
+
+```python
+from huggingface_sb3 import load_from_hub
+from sb3_sap import PermissibilityPredictor
+
+predictor = PermissibilityPredictor.load(load_from_hub("{repo_id}", "predictor.pt"))
+predictor.probabilities(obs, actions)  # of batches
+```"""
 USE = """\
 from huggingface_sb3 import load_from_hub
 from sb3_sap import {class_name}

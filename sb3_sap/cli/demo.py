@@ -18,7 +18,7 @@ from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.cli.animation import animate
 from sb3_sap.cli.hub import EXTRAS
 from sb3_sap.cli.laps import drive_tracks, results_table
-from sb3_sap.cli.options import add_simulator
+from sb3_sap.cli.options import add_path, add_simulator
 from sb3_sap.cli.training_log import TrainingLog, ctrl_c_stops
 from sb3_sap.common.command_line import not_negative, positive
 from sb3_sap.common.files import atomic_path
@@ -44,11 +44,14 @@ class Run:
     simulator: str = "highway"
     out: Path = field(default_factory=lambda: Path("demo_output"))
     animation: bool = True
+    predictor: Path | None = None  # an AP predictor to begin with
 
     @property
     def command(self) -> str:
         """The command that does the same again."""
-        given = {name: getattr(self, name) for name in ("algo", "preset", "steps", "seed", "track", "simulator")}
+        given = {
+            name: getattr(self, name) for name in ("algo", "preset", "steps", "seed", "track", "simulator", "predictor")
+        }
         words = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
         return shlex.join(["sb3-sap", "demo", *words])
 
@@ -58,6 +61,8 @@ def demo(run: Run, console: Console) -> list[LapResult]:
     env = gym.make(ENVIRONMENTS[run.simulator], track=run.track, laps=None, speed=SPEED)
     name = run.preset or ("fast" if "fast" in preset_names(run.algo) else "default")
     settings = preset(name, run.algo, run.steps)
+    if run.predictor is not None:
+        settings["predictor"] = run.predictor
     model = ALGORITHMS[run.algo]("MlpPolicy", env, seed=run.seed, **settings)
     log = TrainingLog()
     try:
@@ -72,10 +77,17 @@ def demo(run: Run, console: Console) -> list[LapResult]:
             (run.out / name).unlink(missing_ok=True)
         with atomic_path(run.out / "model.zip") as temporary:
             model.save(temporary)
+        if hasattr(model, "save_predictor"):
+            model.save_predictor(run.out / "predictor.pt")
         with atomic_path(run.out / "run.json") as temporary:
             taken = len(log.rows)
             command = run.command if taken >= run.steps else f"{run.command}  # interrupted after {taken} steps"
-            described = {**asdict(run), "out": str(run.out), "command": command}
+            described = {
+                **asdict(run),
+                "out": str(run.out),
+                "predictor": run.predictor and str(run.predictor),
+                "command": command,
+            }
             temporary.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
         training = pd.DataFrame(log.rows)
         with atomic_path(run.out / "training.csv") as temporary:
@@ -107,8 +119,8 @@ def add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "demo",
         help="train a car to keep its lane, then drive the unseen tracks",
         description="Trains on one track, drives one lap of each of the paper's four test tracks with the actor alone, "
-        "prints a table, and leaves model.zip, run.json, training.csv, evaluation.json, learning_curve.png, "
-        "predictor.png and lap.gif in the output folder.",
+        "prints a table, and leaves model.zip, predictor.pt, run.json, training.csv, evaluation.json, "
+        "learning_curve.png, predictor.png and lap.gif in the output folder.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--algo", choices=steering, default=default.algo, help="the algorithm")
@@ -120,6 +132,8 @@ def add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
     add_simulator(command)
     command.add_argument("--out", type=Path, default=default.out, help="output folder")
+    text = "an AP predictor to begin with, such as predictor.pt of an earlier run"
+    add_path(command, "--predictor", metavar="FILE", help=text)
     command.add_argument("--animation", action=argparse.BooleanOptionalAction, default=True, help="draw lap.gif")
     command.set_defaults(run=_demo)
 

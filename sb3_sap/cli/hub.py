@@ -16,7 +16,7 @@ from rich.console import Console
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_sap import __version__
-from sb3_sap.cli.card import CARD, USE, USE_NORMALISED, env_arguments
+from sb3_sap.cli.card import CARD, PREDICTOR, USE, USE_NORMALISED, env_arguments
 from sb3_sap.cli.options import add_vecnormalize
 from sb3_sap.common.command_line import positive
 from sb3_sap.common.errors import nearest
@@ -27,7 +27,7 @@ from sb3_sap.evaluation.normalisation import FILE_NAME, NormalisedPolicy
 from sb3_sap.evaluation.policies import load_policy
 
 #: Files of `sb3-sap demo`, besides the model, that are uploaded.
-EXTRAS = ("lap.gif", "learning_curve.png", "predictor.png", "evaluation.json", "training.csv")
+EXTRAS = ("lap.gif", "learning_curve.png", "predictor.png", "evaluation.json", "training.csv", "predictor.pt")
 
 
 @dataclass(frozen=True)
@@ -162,6 +162,7 @@ def prepare(trained: Trained, repo_id: str, folder: Path, n_episodes: int = 10) 
             statistics=FILE_NAME,
             env_arguments=env_arguments(trained.env_id, trained.env_kwargs),
         ),
+        predictor=PREDICTOR.format(repo_id=repo_id) if folder / "predictor.pt" in files else "",
         command=trained.command,
         version=__version__,
         sb3_version=stable_baselines3.__version__,

@@ -15,6 +15,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_sap.algorithms import DDPGAP, DQNAP
 from sb3_sap.common.command_line import not_negative, positive
+from sb3_sap.common.extractors import RescaleExtractor
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.onpolicy.algorithms import PPOAP
 from sb3_sap.predictor.measuring import measure
@@ -65,14 +66,18 @@ def _model(options: argparse.Namespace, **settings: Any) -> Any:
     env = make_env(options.env, **options.env_kwargs)
     finite = isinstance(env.action_space, spaces.Discrete)
     algorithm: Any = DQNAP if finite else DDPGAP if isinstance(env.action_space, spaces.Box) else PPOAP
-    policy = "MlpPolicy"
+    policy, architecture = "MlpPolicy", {"net_arch": options.net_arch} if "net_arch" in options else {}
     if isinstance(env.observation_space, spaces.Dict):
         policy = "MultiInputPolicy"
     elif is_image_space(env.observation_space):
         policy = "CnnPolicy"
+    elif "net_arch" in options and isinstance(env.observation_space, spaces.Box):
+        # Logs are in the units of a machine, and a network hardly tells hundredths from one another.
+        architecture["features_extractor_class"] = RescaleExtractor
     if algorithm is not PPOAP:
         settings["buffer_size"] = 1
-    return algorithm(policy, env, ap_function=options.ap_function, device="cpu", **settings)
+    settings |= {"ap_function": options.ap_function, "predictor_kwargs": architecture}
+    return algorithm(policy, env, device="cpu", **settings)
 
 
 def _read(model: Any, options: argparse.Namespace, console: Console) -> None:
@@ -84,8 +89,7 @@ def _read(model: Any, options: argparse.Namespace, console: Console) -> None:
 
 
 def _fit(options: argparse.Namespace, console: Console) -> int:
-    architecture = {"net_arch": options.net_arch}
-    model = _model(options, seed=options.seed, knowledge_buffer_size=options.examples, predictor_kwargs=architecture)
+    model = _model(options, seed=options.seed, knowledge_buffer_size=options.examples)
     _read(model, options, console)
     report = model.fit_predictor(options.epochs, options.patience, progress_bar=console.is_terminal)
     model.save_predictor(options.out)

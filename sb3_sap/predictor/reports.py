@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+
 
 @dataclass(frozen=True)
 class KnowledgeReport:
@@ -64,9 +66,15 @@ class PredictorReport:
     epochs: int = 0
 
     def __str__(self) -> str:
+        doubt = ""
+        if self.accuracy < SUFFICIENT_ACCURACY:
+            doubt = (
+                f" Below {SUFFICIENT_ACCURACY:.0%} it is not trusted: does the label depend on state and action alone, "
+                "and are the observations of similar size (RescaleExtractor, VecNormalize)?"
+            )
         after = f" after {self.epochs} epochs" if self.epochs else ""
         return (
             f"Balanced accuracy {self.accuracy:.3f}{after}: permits {self.permissible:.1%} of the permissible actions, "
             f"rejects {self.non_permissible:.1%} of the mistakes; calibration error {self.calibration_error:.3f}, "
-            f"on {self.examples:,} actions that it has not learned from."
+            f"on {self.examples:,} actions that it has not learned from.{doubt}"
         )

@@ -31,7 +31,7 @@ def demo(tmp_path_factory):
 def test_demo_writes_its_files(demo):
     names = {path.name for path in demo.iterdir()}
     pictures = {"learning_curve.png", "predictor.png", "lap.gif"}
-    assert names == {"model.zip", "run.json", "training.csv", "evaluation.json"} | pictures
+    assert names == {"model.zip", "predictor.pt", "run.json", "training.csv", "evaluation.json"} | pictures
     assert len(pd.read_csv(demo / "training.csv")) == 200
     rows = json.loads((demo / "evaluation.json").read_text())
     assert [row["track"] for row in rows] == ["eroad", "spring", "g-track-3", "ole-road-1"]
@@ -108,7 +108,7 @@ def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     assert DDPGAP.load(tmp_path / "model.zip").num_timesteps > 0
     taken = len(pd.read_csv(tmp_path / "training.csv"))
     assert taken > 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.zip", "run.json", "training.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model.zip", "predictor.pt", "run.json", "training.csv"]
     command = json.loads((tmp_path / "run.json").read_text())["command"]
     assert command.endswith(f"# interrupted after {taken} steps")
 

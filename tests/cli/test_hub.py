@@ -67,6 +67,14 @@ def test_all_files_are_uploaded_and_the_card_comes_last(run, uploads):
     assert (run / "hub" / model).read_bytes() == (run / "model.zip").read_bytes()
 
 
+def test_predictor_is_uploaded_and_the_card_loads_it(run, uploads):
+    build(DDPGAP).save_predictor(run / "predictor.pt")
+    assert push(run, "--repo-id", "me/car") == 0
+    assert ("predictor.pt", "me/car") in uploads
+    card = (run / "hub" / "README.md").read_text(encoding="utf-8")
+    assert 'PermissibilityPredictor.load(load_from_hub("me/car", "predictor.pt"))' in card
+
+
 def test_card_has_results_command_and_usage(run, uploads):
     assert push(run, "--repo-id", "me/car", "--dry-run") == 0
     assert uploads == []

@@ -11,6 +11,9 @@ from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.values import action_values
 from sb3_sap.predictor.network import PermissibilityPredictor
 
+#: What an action at the bounds counts as where a squashed distribution learns from it.
+INSIDE = 0.99
+
 
 @flush_denormals()
 def permissible_actor_step(actor: Any, predictor: PermissibilityPredictor, observations: Any, coef: float) -> float:
@@ -35,18 +38,26 @@ def permissible_actor_step(actor: Any, predictor: PermissibilityPredictor, obser
 
 @flush_denormals()
 def cloning_step(actor: Any, observations: Any, actions: th.Tensor) -> float:
-    """One gradient step of the actor on its mean squared distance from given actions.
+    """One gradient step towards given actions: on the mean squared distance of a deterministic actor from them, and on
+    minus the log-likelihood of a stochastic one, which also learns how much they vary.
 
-    :param actor: with its ``optimizer``; a stochastic one moves its mean
+    :param actor: with its ``optimizer``
     :param observations: n observation tensors
     :param actions: (n, action_dim), scaled
     :return: the loss before the step
     """
-    loss = F.mse_loss(mean_action(actor, observations), actions)
+    if hasattr(actor, "action_log_prob"):
+        actor.set_training_mode(False)  # as in `mean_action`
+        mean, log_std, more = actor.get_action_dist_params(observations)
+        distribution = actor.action_dist.proba_distribution(mean, log_std, **more)
+        # The bounds themselves have no likelihood under a squashed distribution.
+        loss = -distribution.log_prob(actions.clamp(-INSIDE, INSIDE)).mean()
+    else:
+        loss = F.mse_loss(mean_action(actor, observations), actions)
     actor.optimizer.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     actor.optimizer.step()
-    return loss.item()
+    return float(loss.item())
 
 
 def mean_action(actor: Any, observations: Any) -> th.Tensor:

@@ -11,7 +11,6 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
 
-from sb3_sap.common.arrays import rows_of
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
 from sb3_sap.guidance.auxiliary_loss import cloning_step, permissible_actor_step, permissible_value_step
@@ -51,6 +50,8 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
     ):
         self.actor_permissibility_coef: Any = actor_permissibility_coef
         self.teaching_growth = teaching_growth
+        #: Timestep, counted like ``t_k``, up to which a taught actor stays as it is.
+        self.held_until = 0
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -92,7 +93,13 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         step = permissible_value_step if self.discrete else permissible_actor_step
         return step(self if self.discrete else self.actor, self.predictor, observations, coef)
 
-    def teach_policy(self, steps: int = 1_000) -> float:
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        super()._update_learning_rate(optimizers)
+        if self.lifetime_steps <= self.held_until:
+            for group in cast(Any, self.actor).optimizer.param_groups:
+                group["lr"] = 0.0
+
+    def teach_policy(self, steps: int = 1_000, hold: int = 0) -> float:
         """Teaches the policy what is permissible, before the first step, from the actions that are known.
 
         These are what :meth:`add_knowledge` kept, or else K. A continuous actor regresses on those that are labelled
@@ -100,6 +107,8 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`). Target networks follow.
 
         :param steps: gradient steps
+        :param hold: timesteps from now on for which a continuous actor stays as it was taught, while the critics learn
+            what its actions are worth: at first they would lead it astray
         :return: the mean loss of the last tenth of them
         :raise ValueError: if no permissible action is known, or for discrete actions if E was not fitted
         """
@@ -107,17 +116,19 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         if source.counts("train")[PERMISSIBLE] == 0 or (self.discrete and not self.predictor.fitted):
             missing = "E is not fitted: call `fit_predictor` first" if len(source) else "nothing is known"
             raise ValueError(f"The policy cannot be taught, because {missing}.")
-        losses = []
+        losses, normalize = [], self.get_vec_normalize_env()
         for _ in range(steps):
-            sample = source.sample_own(2 * self.predictor.batch_size, "train", self.get_vec_normalize_env())
+            if self.discrete:
+                sample = source.sample_own(self.predictor.batch_size, "train", normalize, balanced=False)
+            else:
+                sample = source.sample_class(PERMISSIBLE, self.predictor.batch_size, "train", normalize)
             obs: Any = obs_as_tensor(cast(Any, sample.observations), self.device)
             if self.discrete:
                 losses.append(self._permissible_step(obs, 1.0))
             else:
-                good = np.flatnonzero(sample.labels)
-                actions = th.as_tensor(sample.actions[good], device=self.device)
-                losses.append(cloning_step(self.actor, rows_of(obs, good), actions))
+                losses.append(cloning_step(self.actor, obs, th.as_tensor(sample.actions, device=self.device)))
         for own, target in TARGETS:
             if getattr(self, own, None) is not None and getattr(self, target, None) is not None:
                 getattr(self, target).load_state_dict(getattr(self, own).state_dict())
+        self.held_until = 0 if self.discrete else self.lifetime_steps + hold
         return float(np.mean(losses[-max(1, steps // 10) :]))

@@ -225,11 +225,20 @@ class KnowledgeBuffer:
         if not balanced:
             n_permissible = int(self.rng.binomial(2 * (n // 2), self.counts(part)[PERMISSIBLE] / len(self.parts[part])))
         sizes = (2 * (n // 2) - n_permissible, n_permissible)
-        chosen = [self.rng.choice(self.parts[part].slots(label), sizes[label]) for label in CLASSES]
-        slots = self._offset[part] + np.concatenate(chosen)
+        chosen = [self.rng.choice(self.parts[part].slots(label), k) for label, k in enumerate(sizes) if k > 0]
         labels = np.repeat(np.array(CLASSES, dtype=np.float32), sizes)
-        order = self.rng.permutation(len(slots))
-        slots, labels = slots[order], labels[order]
+        order = self.rng.permutation(len(labels))
+        return self._labelled(part, np.concatenate(chosen)[order], labels[order], env)
+
+    def sample_class(
+        self, label: int, n: int, part: Part = "train", env: VecNormalize | None = None
+    ) -> LabelledActions:
+        """n tuples of one class, without `prior`, with replacement."""
+        chosen = self.rng.choice(self.parts[part].slots(label), n)
+        return self._labelled(part, chosen, np.full(n, label, dtype=np.float32), env)
+
+    def _labelled(self, part: Part, slots: Any, labels: FloatArray, env: VecNormalize | None) -> LabelledActions:
+        slots = self._offset[part] + slots
         rows = {key: store[slots] for key, store in self.observations.items()}
         obs: Observations = rows if self._keyed else rows[""]
         return LabelledActions(obs if env is None else env.normalize_obs(obs), self.actions[slots], labels)

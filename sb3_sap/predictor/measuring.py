@@ -19,8 +19,9 @@ from sb3_sap.predictor.reports import PredictorReport
 BINS = 10
 #: Verdicts of each kind that are remembered, and labels after which they are judged.
 WINDOW, FIRST = 100, 50
-#: Mean share of right verdicts, over those of each kind, below which E does not fit what is observed; chance is 0.5.
-STALE = 0.6
+#: Mean share of right verdicts, over those of each kind, below which E contradicts what is observed; chance is 0.5.
+#: Near it are also the verdicts of a good E on the actions of a good policy, where a heuristic label is hard to tell.
+STALE = 0.45
 
 
 @th.no_grad()

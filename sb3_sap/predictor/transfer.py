@@ -141,13 +141,14 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         if not sum(counts.values()):
             reasons = ", ".join(f"{reason} ({n})" for reason, n in refused.items() if n)
             raise ValueError(f"All {rows} transitions were refused: {reasons}.")
-        if len(prior) > 0:
+        if into != "replay" and len(prior) > 0:
             self.knowledge.prior = prior  # type: ignore[assignment]
             self.knowledge.prior_share = self.prior_share
             self._expect_familiarity()
+        kept = len(prior) if into != "replay" else 0
         pieces = 0 if replay is None else replay.attach()
         taken = 0 if replay is None else replay.rows
-        return KnowledgeReport(rows, counts[True], counts[False], counts[None], taken, pieces, refused, len(prior))
+        return KnowledgeReport(rows, counts[True], counts[False], counts[None], taken, pieces, refused, kept)
 
     def fit_predictor(self, epochs: int = 50, patience: int = 5, progress_bar: bool = False) -> PredictorReport:
         """Fits E to what is known before the first step, until it predicts held-out labels no better.

@@ -319,6 +319,33 @@ def test_policy_is_taught_before_the_first_step():
     assert all(th.equal(a, b) for a, b in zip(model.actor.parameters(), model.actor_target.parameters(), strict=True))
 
 
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP])
+def test_taught_policy_is_held_while_the_critics_learn(algorithm):
+    model, _ = known(algorithm, t_k=0, learning_starts=0)
+    model.fit_predictor()
+    model.teach_policy(20, hold=30)
+    before = copy.deepcopy(model.actor.state_dict())
+    critic = copy.deepcopy(model.critic.state_dict())
+    model.learn(30)
+    assert all(th.equal(value, before[name]) for name, value in model.actor.state_dict().items())
+    assert not all(th.equal(value, critic[name]) for name, value in model.critic.state_dict().items())
+    model.learn(10, reset_num_timesteps=False)
+    assert not all(th.equal(value, before[name]) for name, value in model.actor.state_dict().items())
+
+
+def test_stochastic_policy_learns_how_much_the_actions_vary():
+    rng, log = np.random.default_rng(0), line_log()
+    log["actions"] = np.clip(-np.sign(log["obs"][:, :1]) * rng.normal(0.6, 0.05, (2_000, 1)), -1, 1)
+    log["next_obs"][:, 0] = log["obs"][:, 0] + 0.1 * log["actions"][:, 0]
+    log["labels"] = np.ones(2_000, bool)
+    model, _ = known(SACAP, log=log, policy_kwargs={"net_arch": [32]}, learning_rate=0.01)
+    model.teach_policy(1_000)
+    obs = np.tile(np.array([[0.5, 0.5]], np.float32), (500, 1))
+    drawn = model.predict(obs)[0]
+    assert drawn.mean() == pytest.approx(-0.6, abs=0.1)
+    assert drawn.std() == pytest.approx(0.05, abs=0.05)
+
+
 def test_policy_cannot_be_taught_by_nothing():
     with pytest.raises(ValueError, match="nothing is known"):
         build(DDPGAP).teach_policy()

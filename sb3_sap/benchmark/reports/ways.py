@@ -24,6 +24,8 @@ from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 SHARES = (0.25, 0.5, 1.0)
 #: The presets of a penalty alone.
 PENALTY = "base+penalty"
+#: The overrides of the base algorithm.
+NO_PENALTY = (("penalty", "0"),)
 #: S on every track from which a lap-driving policy has learned the task.
 GOOD = 0.95
 NOTE = (
@@ -51,7 +53,8 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     )
     reference = reference_share(results, scores)
     rows = [_row(results, scores, name, reference) for name in results.names]
-    improvements = improvement(results, scores)
+    peer = (PENALTY, NO_PENALTY) if kind == "wrong_labels" else (PENALTY, ())
+    improvements = improvement(results, scores, peer)
     write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
@@ -63,7 +66,8 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
         goal=f"goal ({goal})",
     )
     parts = [f"![Scores over training steps]({kind}.svg)\n", markdown(pd.DataFrame(rows)), note]
-    parts += ["## Probability that a run ends better than one with the penalty\n"]
+    of = "of the base algorithm" if kind == "wrong_labels" else "with the penalty"
+    parts += [f"## Probability that a run ends better than one {of}\n"]
     intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
     parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
     title = "Ways of using the label" + (", with wrong labels" if kind == "wrong_labels" else "")
@@ -82,17 +86,20 @@ def run_scores(results: Results) -> pd.DataFrame:
     return results.laps[always].groupby(keys, sort=False)["score"].mean().reset_index()
 
 
-def improvement(results: Results, scores: pd.DataFrame) -> pd.DataFrame:
-    """Compares each configuration with the penalty that suits all tasks, for the same algorithm, at the end.
+def improvement(
+    results: Results, scores: pd.DataFrame, peer: tuple[str, tuple[tuple[str, str], ...]] = (PENALTY, ())
+) -> pd.DataFrame:
+    """Compares each configuration at the end with another one of the same algorithm.
 
+    :param peer: preset and overrides of the other one, by default the penalty that suits all tasks
     :return: columns ``configuration``, ``against``, ``probability``, ``low`` and ``high``
     """
     rows = []
     for ours in results.configurations:
-        penalty = Configuration(ours.algo, PENALTY).name
-        if penalty in results.names and penalty != ours.name:
-            estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, penalty, 1.0))
-            rows.append([ours.name, penalty, *estimate])
+        other = Configuration(ours.algo, *peer).name
+        if other in results.names and other != ours.name:
+            estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, other, 1.0))
+            rows.append([ours.name, other, *estimate])
     return pd.DataFrame(rows, columns=["configuration", "against", "probability", "low", "high"])
 
 

@@ -42,10 +42,10 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
         imports.append(f"from sb3_sap import {', '.join(names)}")
         # A keyword may not be given twice.
         both = {name: value for name, value in job.settings.items() if name in way.settings}
-        arguments.append(way.code + (f" | {both!r}" if both else ""))
+        arguments.append(way.code + (f" | {_written(both, imports)}" if both else ""))
         own = {name: value for name, value in own.items() if name not in both}
-    arguments += [f"{name}={value!r}" for name, value in own.items()]
-    options = "".join(f", {name}={value!r}" for name, value in job.env_kwargs.items())
+    arguments += [f"{name}={_written(value, imports)}" for name, value in own.items()]
+    options = "".join(f", {name}={_written(value, imports)}" for name, value in job.env_kwargs.items())
     maker = f"gym.make({job.env!r}{options})" if isinstance(job.env, str) else f"{job.env.__name__}({options[2:]})"
     return "\n".join(
         [
@@ -61,6 +61,15 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
             'model.save("model")',
         ]
     )
+
+
+def _written(value: Any, imports: list[str]) -> str:
+    """A setting as Python; the imports of classes and functions in it are added."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {_written(one, imports)}" for key, one in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_written(one, imports) for one in value) + "]"
+    return _imported(value, imports) if hasattr(value, "__qualname__") else repr(value)
 
 
 def _imported(function: Any, imports: list[str]) -> str:

@@ -12,7 +12,7 @@ from sb3_sap.comparison.worker import Job, run_in_process
 
 #: Minimum number of trained steps of a trial, and of a run beyond those that the algorithm takes before it learns.
 TRIED = 200
-#: Seconds to import the libraries and build a model.
+#: Minimum number of seconds to import the libraries and build a model.
 START = 4.0
 
 
@@ -25,16 +25,19 @@ def steps_within(minutes: float, trials: list[Job], seeds: int, jobs: int) -> in
     :raise ValueError: if the time does not suffice for a trial's steps
     """
     warm_up = max(int(job.settings.get("learning_starts", 100)) for job in trials)
+    began = time.monotonic()
     with ThreadPoolExecutor(jobs) as pool:
         measured = list(pool.map(lambda job: _measure(job, warm_up), trials))
-    costs = [step for step, _ in measured]
+    spent = time.monotonic() - began
+    costs = [step for step, _, _ in measured]
     fixed = [
-        START + episode * job.episodes * job.evaluations for job, (_, episode) in zip(trials, measured, strict=True)
+        start + episode * job.episodes * job.evaluations
+        for job, (_, episode, start) in zip(trials, measured, strict=True)
     ]
-    available = 60.0 * minutes * jobs / seeds - sum(fixed)
+    available = (60.0 * minutes - spent) * jobs / seeds - sum(fixed)
     steps = int(available / sum(costs))
     if steps < warm_up + TRIED:
-        needed = (sum(fixed) + sum(costs) * (warm_up + TRIED)) * seeds / jobs / 60
+        needed = (spent + (sum(fixed) + sum(costs) * (warm_up + TRIED)) * seeds / jobs) / 60
         raise ValueError(
             f"{minutes:g} minutes suffice for {max(0, steps)} steps of each run, which is too few to compare: give at "
             f"least {math.ceil(needed)} minutes, or fewer `seeds`, or the number of `steps`."
@@ -42,8 +45,8 @@ def steps_within(minutes: float, trials: list[Job], seeds: int, jobs: int) -> in
     return steps
 
 
-def _measure(job: Job, warm_up: int) -> tuple[float, float]:
-    """Seconds of a training step and of an evaluation episode."""
+def _measure(job: Job, warm_up: int) -> tuple[float, float, float]:
+    """Seconds of a training step, of an evaluation episode, and of everything before the first step."""
     # Two evaluations: the time between them is that of the steps between them and of the second one. In all of these
     # steps the algorithm learns, because the first evaluation comes after the warm-up.
     half = max(warm_up, TRIED)
@@ -54,7 +57,9 @@ def _measure(job: Job, warm_up: int) -> tuple[float, float]:
         if "took" in answer:
             moments.append((time.monotonic() - began, float(answer["took"])))
     (first, _), (second, evaluation) = moments
-    return max(1e-5, (second - first - evaluation) / half), evaluation
+    step = max(1e-5, (second - first - evaluation) / half)
+    # Of the steps before the first evaluation those of the warm-up cost next to nothing.
+    return step, evaluation, max(START, first - evaluation - (half - warm_up) * step)
 
 
 def _check(answer: dict[str, Any]) -> None:

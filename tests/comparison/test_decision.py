@@ -1,11 +1,11 @@
 """From runs to a decision, and to code that trains with it."""
 
-import numpy as np
 import pandas as pd
 import pytest
+from torch import nn
 from toy import Line, towards_centre
 
-from sb3_sap import compare
+from sb3_sap import RescaleExtractor, compare
 from sb3_sap.comparison.code import lines
 from sb3_sap.comparison.decision import Comparison
 from sb3_sap.comparison.pilot import _measure, steps_within
@@ -93,6 +93,22 @@ def test_setting_of_the_user_goes_before_that_of_a_way(monkeypatch, tmp_path):
         assert scope["model"].refit_growth == 0.125
 
 
+def test_classes_in_settings_are_imported(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gymnasium.make", lambda name: Line())
+    settings = {
+        "learning_starts": 5,
+        "batch_size": 4,
+        "policy_kwargs": {"features_extractor_class": RescaleExtractor, "net_arch": [8], "activation_fn": nn.Tanh},
+    }
+    for way in ways("sac_ap", potential=False)[:2]:
+        job = Job("Line-v0", {}, "sac_ap", settings, 0, 12, 10, 1)
+        scope = {}
+        code = lines(way, job, "MlpPolicy", "toy.towards_centre", None)
+        exec(code.replace(", progress_bar=True", ""), scope)
+        assert isinstance(scope["model"].actor.features_extractor, RescaleExtractor)
+
+
 def test_code_names_functions_of_a_notebook_without_importing_them():
     def mine(obs, actions, next_obs):
         return towards_centre(obs, actions, next_obs)
@@ -121,13 +137,16 @@ def test_bad_arguments_get_a_sentence(settings, sentence):
 
 
 def test_steps_follow_from_the_time(monkeypatch):
-    monkeypatch.setattr("sb3_sap.comparison.pilot._measure", lambda job, warm_up: (0.01, 0.1))
+    monkeypatch.setattr("sb3_sap.comparison.pilot._measure", lambda job, warm_up: (0.01, 0.1, 4.0))
+    now = iter([0.0, 0.0, 0.0, 0.0, 0.0, 60.0])
+    monkeypatch.setattr("sb3_sap.comparison.pilot.time.monotonic", lambda: next(now))
     jobs = [Job("x", {}, "sac_ap", {}, 0, 0, 10, 5)] * 3
     # 600 s of two processors for 3 ways of 4 seeds: 300 s, less 3 · (4 + 5) s, at 3 · 0.01 s a step.
     assert steps_within(10, jobs, seeds=4, jobs=2) == int((300 - 27) / 0.03)
     with pytest.raises(ValueError, match=r"^1 minutes suffice for 100 steps of each run, .* give at least 2 minutes"):
         steps_within(1, jobs, seeds=4, jobs=2)
-    assert np.isfinite(steps_within(60, jobs, seeds=4, jobs=2))
+    # The trials themselves take a minute of ten.
+    assert steps_within(10, jobs, seeds=4, jobs=2) == int((270 - 27) / 0.03)
 
 
 def test_steps_before_learning_do_not_count_as_trained(monkeypatch):
@@ -142,6 +161,6 @@ def test_steps_before_learning_do_not_count_as_trained(monkeypatch):
 
     monkeypatch.setattr("sb3_sap.comparison.pilot.run_in_process", run)
     monkeypatch.setattr("sb3_sap.comparison.pilot.time.monotonic", lambda: now)
-    per_step, episode = _measure(Job("x", {}, "sac_ap", {}, 0, 0, 10, 5), 1_000)
+    per_step, episode, start = _measure(Job("x", {}, "sac_ap", {}, 0, 0, 10, 5), 1_000)
     assert per_step == pytest.approx(0.01)
-    assert episode == 0.5
+    assert (episode, start) == (0.5, 5.0)

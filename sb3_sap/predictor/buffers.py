@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_sap.common.arrays import FloatArray
 from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
 from sb3_sap.common.spaces import unscaled
 from sb3_sap.common.vec_envs import environment_layout
@@ -33,8 +34,8 @@ class KnowledgeMixin(ReplayBuffer):
     shaping: RewardShaping
     #: Whether a transition without a label is an error; otherwise it is not added to K.
     needs_labels: bool = True
-    #: Whether any stored reward differs from the environment's own.
-    rewards_are_shaped: bool = False
+    #: (buffer_size, n_envs) what the stored rewards hold beside the environment's own; None: nothing.
+    added: FloatArray | None = None
     #: Transitions from elsewhere, in buffers of this kind.
     prior: tuple[KnowledgeMixin, ...] = ()
     #: The share of a batch that comes from `prior`.
@@ -68,7 +69,10 @@ class KnowledgeMixin(ReplayBuffer):
         _, added = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
         if added is not None:
             reward = reward + added
-            self.rewards_are_shaped = True
+            if self.added is None:
+                self.added = np.zeros_like(self.rewards)
+        if self.added is not None:
+            self.added[self.pos] = 0.0 if added is None else added
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:

@@ -49,8 +49,8 @@ class PriorReplay:
             return
         if batch.rewards is None:
             raise ValueError(
-                "The replay buffer needs rewards, which these transitions do not have (a replay buffer whose rewards "
-                'hold a penalty does not give them): give them, or use `into="knowledge"`.'
+                "The replay buffer needs rewards, which these transitions do not have: give them, or use "
+                '`into="knowledge"`.'
             )
         if not sound.any():
             return

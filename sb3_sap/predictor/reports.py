@@ -19,6 +19,7 @@ class KnowledgeReport:
     :param into_replay: taken into the replay buffer
     :param episodes: of those, the number of episodes or of unbroken pieces
     :param refused: how many rows were refused, by reason
+    :param without_rewards: whether the replay buffer was left out because there are no rewards
     :param kept_examples: labelled actions that are kept for E, a balanced random sample of all
     """
 
@@ -30,6 +31,7 @@ class KnowledgeReport:
     episodes: int = 0
     refused: Counter[str] = field(default_factory=Counter)
     kept_examples: int = 0
+    without_rewards: bool = False
 
     def __str__(self) -> str:
         labelled = self.permissible + self.non_permissible
@@ -37,6 +39,8 @@ class KnowledgeReport:
         if labelled:
             share = self.non_permissible / labelled
             parts.append(f"{labelled:,} labelled, {share:.1%} of them mistakes; {self.kept_examples:,} kept for E")
+        if labelled and not self.into_replay and self.without_rewards:
+            parts.append("there are no rewards, so that the replay buffer got none")
         if self.into_replay:
             parts.append(f"{self.into_replay:,} in {self.episodes:,} pieces put beside the replay buffer")
         parts += [f"{n:,} refused: {reason}" for reason, n in self.refused.items() if n]

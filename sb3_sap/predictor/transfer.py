@@ -148,7 +148,8 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         kept = len(prior) if into != "replay" else 0
         pieces = 0 if replay is None else replay.attach()
         taken = 0 if replay is None else replay.rows
-        return KnowledgeReport(rows, counts[True], counts[False], counts[None], taken, pieces, refused, kept)
+        missed = replay is not None and taken == 0
+        return KnowledgeReport(rows, counts[True], counts[False], counts[None], taken, pieces, refused, kept, missed)
 
     def fit_predictor(self, epochs: int = 50, patience: int = 5, progress_bar: bool = False) -> PredictorReport:
         """Fits E to what is known before the first step, until it predicts held-out labels no better.

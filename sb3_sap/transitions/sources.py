@@ -133,12 +133,13 @@ def buffer_batches(buffer: ReplayBuffer, images: tuple[str, ...] = ()) -> Iterat
     """The transitions of a replay buffer of any algorithm, environment by environment, oldest first.
 
     SB3 scales the actions of a ``Box`` to [-1, 1]. With ``optimize_memory_usage`` the next observation of a row is the
-    observation of the next row, so that that of an episode's last step is lost: those rows are left out. A buffer whose
-    rewards hold a penalty or a potential gives none.
+    observation of the next row, so that that of an episode's last step is lost: those rows are left out. Of
+    rewards with a penalty or a potential it gives those of the environment.
     """
     size, start = buffer.size(), buffer.pos if buffer.full else 0
     order = (start + np.arange(size)) % buffer.buffer_size
     shared = buffer.optimize_memory_usage
+    added = getattr(buffer, "added", None)
     for env in range(buffer.n_envs):
         for begin in range(0, size, ROWS):
             rows = order[begin : begin + ROWS]
@@ -155,7 +156,7 @@ def buffer_batches(buffer: ReplayBuffer, images: tuple[str, ...] = ()) -> Iterat
                 environment_layout(obs, images),
                 unscaled(buffer.action_space, actions),
                 environment_layout(next_obs, images),
-                None if getattr(buffer, "rewards_are_shaped", False) else buffer.rewards[rows, env],
+                buffer.rewards[rows, env] - (0.0 if added is None else added[rows, env]),
                 buffer.dones[rows, env].astype(bool),
                 timeouts[rows, env].astype(bool),
             )

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from stable_baselines3 import DQN, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
-from toy import Line, build
+from toy import Line, build, centred
 
 from sb3_sap import SACAP
 from sb3_sap.transitions.sources import batches_of, joined
@@ -232,11 +232,13 @@ def test_discrete_actions_of_a_replay_buffer():
     np.testing.assert_allclose(batch.next_obs[:, 0] - batch.obs[:, 0], 0.1 * (batch.actions - 1), atol=1e-6)
 
 
-def test_penalised_replay_buffer_gives_no_rewards():
+@pytest.mark.parametrize("settings", [{"penalty": 1.0}, {"penalty": "auto"}, {"potential": centred}])
+def test_replay_buffer_with_a_penalty_gives_the_rewards_of_the_environment(settings):
     """Or the penalty would be subtracted twice."""
-    model = build(SACAP, penalty=1.0)
-    model.learn(30)
-    assert whole(model.replay_buffer).rewards is None
+    model = build(SACAP, **settings, buffer_size=24).learn(30)
+    batch = whole(model.replay_buffer)
+    np.testing.assert_allclose(batch.rewards, -np.abs(batch.next_obs[:, 0]), atol=1e-5)
+    assert (model.replay_buffer.rewards[:, 0] != batch.rewards).any()
 
 
 @pytest.mark.parametrize(

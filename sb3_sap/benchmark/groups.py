@@ -101,6 +101,25 @@ GROUPS: dict[str, list[str]] = {
         f"ppo_ap:{presets}"
         for presets in ("base+penalty[penalty=0]", "base+penalty[penalty=50]", "base+penalty", "base+loss")
     ],
+    # What a run begins with, from an agent on the embedded simulator and from logs. A policy that knows something
+    # already needs less entropy.
+    "starts": [
+        f"{algo}_started:base+{presets}[start={start}{more}]"
+        for algo, more in (("ddpg_ap", ""), ("sac_ap", ",ent_coef=auto_0.1"))
+        for presets, start in (
+            ("penalty", "nothing"),
+            ("loss", "nothing"),
+            ("loss", "predictor"),
+            ("penalty", "policy"),
+            ("loss", "policy_predictor"),
+            ("penalty", "replay"),
+            ("penalty", "cloned"),
+            ("loss", "taught"),
+            ("penalty", "cloned,source=log"),
+            ("loss", "taught,source=log"),
+            ("loss", "taught,source=random"),
+        )
+    ],
     # The same with labels that are wrong: one in ten, or all in a region.
     "wrong_labels": [
         "ddpg_ap:base+penalty[penalty=0]",

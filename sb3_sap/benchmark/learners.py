@@ -37,6 +37,8 @@ CLASSES = {algo: f"sb3_sap:{cls.__name__}" for algo, cls in (ALGORITHMS | ON_POL
     "ddpg_ap_unbalanced": "sb3_sap.benchmark.ablated:DDPGAPUnbalanced",
     "ddpg_ap_proposed": "sb3_sap.benchmark.ablated:DDPGAPProposed",
     "sac_recovery": "sb3_sap.benchmark.recovery:SACRecovery",
+    "ddpg_ap_started": "sb3_sap.benchmark.started:DDPGAPStarted",
+    "sac_ap_started": "sb3_sap.benchmark.started:SACAPStarted",
     "td3": "stable_baselines3:TD3",
     "sac": "stable_baselines3:SAC",
     "tqc": "sb3_contrib:TQC",
@@ -52,6 +54,8 @@ NAMESAKES = {algo: algo.removeprefix("sbx_") for algo in CLASSES if algo.startsw
     "ddpg_ap_unbalanced": "ddpg_ap",
     "ddpg_ap_proposed": "ddpg_ap",
     "sac_recovery": "sac_ap",
+    "ddpg_ap_started": "ddpg_ap",
+    "sac_ap_started": "sac_ap",
 }
 #: Prefix of overrides that change the environment instead of the algorithm.
 ENVIRONMENT = "env."

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -21,6 +23,7 @@ from sb3_sap.permissibility import ActionPermissibility, labels_from_infos
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.network import SUFFICIENT_ACCURACY, PermissibilityPredictor, query_candidates
 from sb3_sap.predictor.schedule import check_growth, due
+from sb3_sap.predictor.weights import check_same_spaces, check_statistics
 
 
 class LearnedPermissibility(ActionPermissibility):
@@ -48,6 +51,8 @@ class LearnedPermissibility(ActionPermissibility):
     :param min_per_class: examples of each class that K must hold before E is fitted
     :param predictor_kwargs: arguments of :class:`~sb3_sap.predictor.network.PermissibilityPredictor`
     :param seed: of all random draws
+    :param predictor: an AP predictor of the same spaces to begin with, which was fitted to raw observations, or its
+        file; it goes on learning
     :raise ValueError: for a setting or a space that cannot be used
     """
 
@@ -64,6 +69,7 @@ class LearnedPermissibility(ActionPermissibility):
         min_per_class: int = 20,
         predictor_kwargs: dict[str, Any] | None = None,
         seed: int | None = None,
+        predictor: PermissibilityPredictor | str | Path | None = None,
     ):
         super().__init__(env, permissible, penalty)
         if not (is_number(alpha) and 0 <= alpha <= 1):
@@ -83,7 +89,16 @@ class LearnedPermissibility(ActionPermissibility):
             self.predictor = PermissibilityPredictor(self.observation_space, self.action_space, **arguments)
         #: Balanced accuracy of E on its last validation sample; NaN before the first.
         self.validation_accuracy = float("nan")
+        if predictor is not None:
+            self._take_over(predictor)
         self._steps = 0
+
+    def _take_over(self, given: PermissibilityPredictor | str | Path) -> None:
+        given = PermissibilityPredictor.load(given, "cpu") if isinstance(given, (str, Path)) else copy.deepcopy(given)
+        check_same_spaces(given, self.observation_space, self.action_space)
+        check_statistics(given.about.get("statistics"), None)
+        self.predictor = given
+        self.validation_accuracy = float(given.about.get("accuracy", float("nan")))
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         obs, executed = self._obs, self._permitted(action)

@@ -25,7 +25,7 @@ from sb3_sap.predictor.learned import LearnedPredictorMixin
 from sb3_sap.predictor.measuring import Familiarity
 from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.reports import KnowledgeReport, PredictorReport
-from sb3_sap.predictor.weights import check_statistics, statistics_of
+from sb3_sap.predictor.weights import check_same_spaces, check_statistics, statistics_of
 from sb3_sap.transitions.batch import Transitions, fitting
 from sb3_sap.transitions.sources import batches_of
 from sb3_sap.transitions.tables import Columns
@@ -77,13 +77,7 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         """
         if isinstance(predictor, (str, Path)):
             predictor = PermissibilityPredictor.load(predictor, self.device)
-        for name in ("observation_space", "action_space"):
-            own, other = getattr(self, name), getattr(predictor, name)
-            if own != other:
-                raise ValueError(
-                    f"The AP predictor is of the {name} {other}, but this model's is {own}: it can only be used with "
-                    "the same spaces."
-                )
+        check_same_spaces(predictor, self.observation_space, self.action_space)
         check_statistics(predictor.about.get("statistics"), self.get_vec_normalize_env())
         self.predictor, self._predictor_architecture = make_predictor(self, {}, predictor)
         # `load` builds the same predictor.

@@ -91,6 +91,17 @@ def read_predictor(cls: Any, path: str | Path, device: Any = "auto", **arguments
     return predictor
 
 
+def check_same_spaces(predictor: Any, observation_space: Any, action_space: Any) -> None:
+    """Raises a ``ValueError`` if a predictor is of other spaces."""
+    for name, own in (("observation_space", observation_space), ("action_space", action_space)):
+        other = getattr(predictor, name)
+        if own != other:
+            raise ValueError(
+                f"The AP predictor is of the {name} {other}, but here it is {own}: it can only be used with the same "
+                "spaces."
+            )
+
+
 def statistics_of(env: VecNormalize | None) -> dict[str, Any] | None:
     """How observations are normalised, as plain data; None: they are not."""
     if env is None or not env.norm_obs:

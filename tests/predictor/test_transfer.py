@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import DISCRETE, GUIDED, Line, build, towards_centre
 
-from sb3_sap import A2CAP, DDPGAP, DQNAP, PPOAP, SACAP, PermissibilityPredictor
+from sb3_sap import A2CAP, DDPGAP, DQNAP, PPOAP, SACAP, LearnedPermissibility, PermissibilityPredictor
 from sb3_sap.transitions.sources import batches_of, joined
 
 WIDE = {"dataset_size": 128, "predictor_kwargs": {"net_arch": [32], "batch_size": 64}, "min_per_class": 2}
@@ -404,6 +404,18 @@ def test_predictor_is_saved_and_taken_by_another_algorithm(tmp_path):
     model.learn(60)
     on_policy = PPOAP("MlpPolicy", Line(), n_steps=16, batch_size=16, predictor=tmp_path / "e.pt")
     on_policy.learn(32)
+
+
+def test_wrapper_for_other_libraries_begins_with_a_predictor(tmp_path):
+    donor = fitted()
+    donor.save_predictor(tmp_path / "e.pt")
+    for given in (tmp_path / "e.pt", donor.predictor):
+        env = LearnedPermissibility(Line(), predictor=given, alpha=1.0, seed=0)
+        env.reset(seed=0, options={"x": 0.5})
+        *_, info = env.step(np.array([0.9], np.float32))
+        assert info["replaced"]
+    with pytest.raises(ValueError, match="only be used with the same spaces"):
+        LearnedPermissibility(Line(dim=2), predictor=donor.predictor)
 
 
 def test_loaded_predictor_judges_alone(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -59,6 +60,8 @@ class Guide:
         self._judged: dict[bytes, BoolArray] = {}  # E's verdicts on all actions of a state
         #: The known masks of the rollout's states.
         self.known: dict[bytes, BoolArray] = {}
+        #: Draws from a continuous policy in each state of the rollout: what was drawn, its log-density, E's verdicts.
+        self._drawn: dict[bytes, tuple[th.Tensor, th.Tensor, th.Tensor]] = {}
         self.actions: th.Tensor | None = None
         if not isinstance(space, spaces.Box):
             actions = joint_actions(space)
@@ -72,11 +75,10 @@ class Guide:
         :param executed: (n, *action_shape) actions to be evaluated, which were chosen with the same E
         """
         if self.actions is None:
-            if executed is not None:
-                return distribution  # see `first_permissible`
             # The object is the policy's own, and used again.
             guided = copy.copy(distribution)
             guided.get_actions = partial(self.first_permissible, obs, distribution)  # type: ignore[method-assign]
+            guided.log_prob = partial(self.log_prob, obs, distribution)  # type: ignore[method-assign]
             return guided
         mask = self.mask(obs)
         if executed is not None:
@@ -140,10 +142,7 @@ class Guide:
         """(n, action_dim) the first of ``n_candidates`` draws from a continuous policy that E permits.
 
         If E permits none, it is the first draw. The first draw is the policy's own; the others are drawn in one call.
-        The executed action has the density π · 1[E > 0] / Z. Its log-probability is taken to be the policy's log π:
-        in each state the expected advantage under the executed density is zero, and so is that of ∇ log Z, which is
-        the same for all actions of the state, so that leaving it out is unbiased to first order. An estimate of Z
-        from a few draws would bring noise instead.
+        The executed action has the density π · 1[E > 0] / Z (:meth:`log_prob`).
 
         :param deterministic: the mode, or the candidate nearest to it among stratified ones of a fixed seed
         """
@@ -152,13 +151,26 @@ class Guide:
         features = self.predictor.features(obs)
         rejected = self.predictor.logits(features, self.scaled(proposed)) <= 0
         self._record("sap/rejection_rate", rejected.float().mean().item())
-        rows = rejected.nonzero().flatten()
-        if len(rows) == 0 or self.n_candidates == 1:
+        if self.n_candidates == 1:
             return proposed
-        candidates = self._around(proposed[rows]) if deterministic else self._draws(distribution, rows)  # (m, N, dim)
-        m, n, dim = candidates.shape
-        scaled = self.scaled(candidates.reshape(m * n, dim))
-        verdicts = self.predictor.logits(features[rows].repeat_interleave(n, dim=0), scaled).reshape(m, n) > 0
+        if deterministic:
+            rows = rejected.nonzero().flatten()
+            candidates = self._around(proposed[rows])  # (m, N, dim)
+            verdicts = self._permits(features[rows], candidates)
+        else:
+            # In all states, because the share of them that is permitted says how dense the executed action is.
+            plain = self._draws(distribution)
+            bijector = getattr(distribution, "bijector", None)
+            drawn = plain if bijector is None else bijector.forward(plain)
+            permitted = self._permits(features, drawn)
+            if not self.predicts:
+                density = _log_density(distribution, plain)
+                for row, state in enumerate(_rows_as_bytes(obs)):
+                    self._drawn.setdefault(state, (plain[row], density[row], permitted[row]))
+            rows = rejected.nonzero().flatten()
+            candidates, verdicts = drawn[rows], permitted[rows]
+        if len(rows) == 0:
+            return proposed
         found = verdicts.any(dim=1)
         self._record("sap/fallback_rate", 1 - found.float().mean().item())
         first = verdicts.int().argmax(dim=1)
@@ -166,14 +178,39 @@ class Guide:
         guided[rows[found]] = candidates[found, first[found]]
         return guided
 
-    def _draws(self, distribution: Any, rows: th.Tensor) -> th.Tensor:
-        """(m, N - 1, action_dim) further draws in the states of ``rows``."""
+    def log_prob(self, obs: Any, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
+        """(n,) log π(a) − log Z of executed continuous actions, Z being estimated from the draws of the rollout.
+
+        Z is the share of draws that E permits; in an update, where the policy has changed since they were drawn, each
+        counts as much as it has become more likely, so that both sides of PPO's ratio have their Z. Without it, an
+        error of the value would draw the policy towards or away from what E permits, for the expected score of the
+        executed actions is ∇ log Z, and not zero (`measurements/continuous_choice.py`). Where no draw is permitted,
+        and the executed action is the policy's own, Z is 1.
+        """
+        log_prob = distribution.log_prob(actions)
+        known = [(row, self._drawn[state]) for row, state in enumerate(_rows_as_bytes(obs)) if state in self._drawn]
+        known = [(row, draws) for row, draws in known if draws[2].any()]
+        if not known:
+            return log_prob
+        rows = th.as_tensor([row for row, _ in known], device=log_prob.device)
+        plain, density, permitted = (th.stack(parts) for parts in zip(*(draws for _, draws in known), strict=True))
+        change = _log_density(distribution, plain, rows) - density
+        log_share = change.masked_fill(~permitted, -th.inf).logsumexp(dim=1) - math.log(plain.shape[1])
+        return log_prob.index_add(0, rows, -log_share)
+
+    def _permits(self, features: th.Tensor, candidates: th.Tensor) -> th.Tensor:
+        """(m, N) bool, which of N actions in m states E permits."""
+        assert self.predictor is not None
+        m, n, dim = candidates.shape
+        scaled = self.scaled(candidates.reshape(m * n, dim))
+        return self.predictor.logits(features.repeat_interleave(n, dim=0), scaled).reshape(m, n) > 0
+
+    def _draws(self, distribution: Any) -> th.Tensor:
+        """(n, N - 1, action_dim) further draws, before they are squashed."""
         normal = distribution.distribution
         # gSDE's own noise is the same at every call: this is its distribution over many.
-        own = th.distributions.Normal(normal.mean[rows], normal.stddev[rows])
-        drawn = own.sample(th.Size([self.n_candidates - 1])).transpose(0, 1)  # type: ignore[no-untyped-call]
-        bijector = getattr(distribution, "bijector", None)
-        return drawn if bijector is None else bijector.forward(drawn)  # type: ignore[no-any-return]
+        own = th.distributions.Normal(normal.mean, normal.stddev)
+        return own.sample(th.Size([self.n_candidates - 1])).transpose(0, 1)  # type: ignore[no-untyped-call, no-any-return]
 
     def _around(self, proposed: th.Tensor) -> th.Tensor:
         """(m, N, action_dim) candidates from the whole space, the nearest to the proposed actions first."""
@@ -205,6 +242,13 @@ class Guide:
     def _record(self, name: str, value: float) -> None:
         if self.logger is not None:
             self.logger.record_mean(name, value)
+
+
+def _log_density(distribution: Any, plain: th.Tensor, rows: Any = slice(None)) -> th.Tensor:
+    """(m, N) log-densities of (m, N, action_dim) draws, before they are squashed, in the states of ``rows``."""
+    normal = distribution.distribution
+    own = th.distributions.Normal(normal.mean[rows, None], normal.stddev[rows, None])
+    return own.log_prob(plain).sum(dim=2)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def _rows_as_bytes(obs: Any) -> list[bytes]:

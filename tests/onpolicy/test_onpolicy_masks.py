@@ -145,16 +145,57 @@ def test_executed_action_counts_as_permitted_in_the_update():
 
 
 @pytest.mark.parametrize("algorithm", BASES)
-def test_continuous_action_is_the_first_permissible_draw_with_the_policys_log_probability(algorithm):
+def test_continuous_action_is_the_first_permissible_draw_with_its_own_log_probability(algorithm):
     env = Line()
     model = judged_by(above(0.0), algorithm, env)
     model.learn(16)
     assert len(env.executed) == 16
     assert min(action[0] for action in env.executed) > 0  # all of 32 draws from N(0, 1) are negative once in 4e9
     buffer = model.rollout_buffer
-    # The policy's standard deviation was 1 and its mean nearly 0.
+    # The policy's standard deviation was 1 and its mean nearly 0, so that about half of 31 draws are permitted.
     normal = -0.5 * math.log(2 * math.pi) - 0.5 * buffer.actions.reshape(-1) ** 2
-    np.testing.assert_allclose(buffer.log_probs.reshape(-1), normal, atol=0.15)
+    share = np.exp(normal - buffer.log_probs.reshape(-1))
+    assert share.mean() == pytest.approx(0.5, abs=0.1)
+    assert share.std() < 0.2
+
+
+@pytest.mark.parametrize("sde", [False, True])
+def test_update_begins_with_a_ratio_of_one_and_the_gradient_of_the_conditioned_density(sde):
+    """The gradient of log Z with respect to the mean, where actions above 0 are permitted, is φ(μ) / Φ(μ)."""
+    settings = {"use_sde": True, "policy_kwargs": {"net_arch": [8], "log_std_init": 0.0}} if sde else {}
+    model = judged_by(above(0.0), PPOAP, Line(), n_candidates=4_000, **settings)
+    policy, obs = model.policy, th.rand(6, 2)
+    with model._guided_by(model._guide()):
+        actions, _, before = policy.forward(obs)
+        assert (actions > 0).all()
+        _, after, _ = policy.evaluate_actions(obs, actions)
+        th.testing.assert_close(after, before, atol=1e-5, rtol=0)
+        policy.optimizer.zero_grad()
+        after.sum().backward()
+    with th.no_grad():
+        unguided = policy.get_distribution(obs).distribution
+    mean, std = unguided.mean[:, 0], unguided.stddev[:, 0]
+    score = (actions[:, 0] - mean) / std**2
+    density = th.exp(-0.5 * (mean / std) ** 2) / math.sqrt(2 * math.pi) / std
+    expected = score - density / th.special.ndtr(mean / std)
+    assert policy.action_net.bias.grad.item() == pytest.approx(expected.sum().item(), rel=0.1, abs=0.3)
+
+
+def test_ratio_follows_the_change_of_the_permitted_share():
+    model = judged_by(above(0.0), PPOAP, Line(), n_candidates=20_000)
+    policy, obs = model.policy, th.zeros(1, 2)
+    with model._guided_by(model._guide()):
+        actions, _, before = policy.forward(obs)
+        with th.no_grad():
+            mean = policy.get_distribution(obs).distribution.mean.item()
+            policy.action_net.bias += 0.3
+        _, after, _ = policy.evaluate_actions(obs, actions)
+
+    def log_density(mean):
+        share = 0.5 * math.erfc(-mean / math.sqrt(2))
+        return -0.5 * (actions.item() - mean) ** 2 - math.log(share)
+
+    assert (after - before).item() == pytest.approx(log_density(mean + 0.3) - log_density(mean), abs=0.03)
 
 
 def test_where_no_draw_is_permissible_the_first_is_executed():

@@ -36,6 +36,7 @@ class Guide:
     :param squashed: whether the policy's actions are scaled to [-1, 1]
     :param device: of the policy
     :param predicts: whether ``predict`` is guided, too
+    :param seed: of the further draws, which take nothing from the policy's generator
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class Guide:
         squashed: bool,
         device: th.device,
         predicts: bool = False,
+        seed: int = 0,
     ):
         self.predictor = predictor
         self.space = space
@@ -60,6 +62,7 @@ class Guide:
         self._judged: dict[bytes, BoolArray] = {}  # E's verdicts on all actions of a state
         #: The known masks of the rollout's states.
         self.known: dict[bytes, BoolArray] = {}
+        self._generator = th.Generator(device).manual_seed(seed)
         #: Draws from a continuous policy in each state of the rollout: what was drawn, its log-density, E's verdicts.
         self._drawn: dict[bytes, tuple[th.Tensor, th.Tensor, th.Tensor]] = {}
         self.actions: th.Tensor | None = None
@@ -184,12 +187,12 @@ class Guide:
         Z is the share of draws that E permits; in an update, where the policy has changed since they were drawn, each
         counts as much as it has become more likely, so that both sides of PPO's ratio have their Z. Without it, an
         error of the value would draw the policy towards or away from what E permits, for the expected score of the
-        executed actions is ∇ log Z, and not zero (`measurements/continuous_choice.py`). Where no draw is permitted,
-        and the executed action is the policy's own, Z is 1.
+        executed actions is ∇ log Z, and not zero (`measurements/continuous_choice.py`). Where all draws are permitted,
+        or none is, so that the executed action is the policy's own, Z is 1.
         """
         log_prob = distribution.log_prob(actions)
         known = [(row, self._drawn[state]) for row, state in enumerate(_rows_as_bytes(obs)) if state in self._drawn]
-        known = [(row, draws) for row, draws in known if draws[2].any()]
+        known = [(row, draws) for row, draws in known if draws[2].any() and not draws[2].all()]
         if not known:
             return log_prob
         rows = th.as_tensor([row for row, _ in known], device=log_prob.device)
@@ -207,10 +210,11 @@ class Guide:
 
     def _draws(self, distribution: Any) -> th.Tensor:
         """(n, N - 1, action_dim) further draws, before they are squashed."""
-        normal = distribution.distribution
         # gSDE's own noise is the same at every call: this is its distribution over many.
-        own = th.distributions.Normal(normal.mean, normal.stddev)
-        return own.sample(th.Size([self.n_candidates - 1])).transpose(0, 1)  # type: ignore[no-untyped-call, no-any-return]
+        normal = distribution.distribution
+        shape = (len(normal.mean), self.n_candidates - 1, normal.mean.shape[1])
+        noise = th.randn(shape, generator=self._generator, device=normal.mean.device)
+        return normal.mean[:, None] + normal.stddev[:, None] * noise  # type: ignore[no-any-return]
 
     def _around(self, proposed: th.Tensor) -> th.Tensor:
         """(m, N, action_dim) candidates from the whole space, the nearest to the proposed actions first."""

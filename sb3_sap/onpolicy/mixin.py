@@ -226,7 +226,11 @@ class OnPolicyPermissibilityMixin(PriorKnowledgeMixin, SavingMixin, OnPolicyAlgo
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, rollout_buffer: Any, n_rollout_steps: int) -> Any:
         """SB3's ``collect_rollouts``, guided while E is accurate, with the labels' share in the stored rewards."""
         asks = bool(self.alpha) and self._judges
-        guide = self._rollout_guide = self._guide(asks) if asks or self._permissible_actions is not None else None
+        # Of K's generator, which is saved with the model.
+        draws = asks and isinstance(self.action_space, spaces.Box)
+        seed = int(self.knowledge.rng.integers(2**31)) if draws else 0
+        guided = asks or self._permissible_actions is not None
+        guide = self._rollout_guide = self._guide(asks, seed=seed) if guided else None
         self.logger.record("sap/alpha", float(asks))
         with self._guided_by(guide), shaped_rewards(rollout_buffer, self._label_callback):
             if guide is not None and self._permissible_actions is not None:
@@ -285,11 +289,11 @@ class OnPolicyPermissibilityMixin(PriorKnowledgeMixin, SavingMixin, OnPolicyAlgo
         """Whether E is accurate enough for anything to follow its verdicts."""
         return self.predictor.fitted and self.predictor_accurate
 
-    def _guide(self, asks: bool = True, predicts: bool = False) -> Guide:
+    def _guide(self, asks: bool = True, predicts: bool = False, seed: int = 0) -> Guide:
         """:param asks: whether E is asked; else there are known masks alone."""
         predictor = self.predictor if asks else None
         squashed = self.policy.squash_output
-        guide = Guide(predictor, self.action_space, self.n_candidates, squashed, self.device, predicts)
+        guide = Guide(predictor, self.action_space, self.n_candidates, squashed, self.device, predicts, seed)
         guide.logger = None if predicts else self.logger
         return guide
 

@@ -22,6 +22,8 @@ from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 #: Shares of the training after which the score is told.
 SHARES = (0.25, 0.5, 1.0)
+#: The same where the first steps matter.
+EARLY_SHARES = (0.2, 0.3, 0.5, 0.7, 1.0)
 #: The presets of a penalty alone.
 PENALTY = "base+penalty"
 #: The overrides of the base algorithm.
@@ -52,9 +54,9 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
         line_figure(scores, results.names, "checkpoint", "score", "training step", "S" if laps else "mean return"),
     )
     reference = reference_share(results, scores)
-    rows = [_row(results, scores, name, reference) for name in results.names]
-    peer = (PENALTY, NO_PENALTY) if kind == "wrong_labels" else (PENALTY, ())
-    improvements = improvement(results, scores, peer)
+    shares = EARLY_SHARES if kind == "starts" else SHARES
+    rows = [_row(results, scores, name, reference, shares) for name in results.names]
+    improvements = improvement(results, scores, kind)
     write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
@@ -66,11 +68,14 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
         goal=f"goal ({goal})",
     )
     parts = [f"![Scores over training steps]({kind}.svg)\n", markdown(pd.DataFrame(rows)), note]
-    of = "of the base algorithm" if kind == "wrong_labels" else "with the penalty"
+    of = {"wrong_labels": "of the base algorithm", "starts": "from scratch with the loss"}.get(kind, "with the penalty")
     parts += [f"## Probability that a run ends better than one {of}\n"]
     intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
     parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
-    title = "Ways of using the label" + (", with wrong labels" if kind == "wrong_labels" else "")
+    title = {
+        "wrong_labels": "Ways of using the label, with wrong labels",
+        "starts": "What a run begins with",
+    }.get(kind, "Ways of using the label")
     title = f"{title} ({results.simulator}, {results.steps:,} steps)"
     write_page(folder / f"{kind}.md", title, parts, results, command)
 
@@ -86,17 +91,26 @@ def run_scores(results: Results) -> pd.DataFrame:
     return results.laps[always].groupby(keys, sort=False)["score"].mean().reset_index()
 
 
-def improvement(
-    results: Results, scores: pd.DataFrame, peer: tuple[str, tuple[tuple[str, str], ...]] = (PENALTY, ())
-) -> pd.DataFrame:
-    """Compares each configuration at the end with another one of the same algorithm.
+def peer(ours: Configuration, kind: str) -> Configuration:
+    """What a configuration is compared with: the same algorithm with the penalty that suits all tasks, without a
+    penalty, or with the loss and without a start.
+    """
+    if kind == "wrong_labels":
+        return Configuration(ours.algo, PENALTY, NO_PENALTY)
+    if kind == "starts":
+        kept = [(key, "nothing" if key == "start" else value) for key, value in ours.overrides if key != "source"]
+        return Configuration(ours.algo, "base+loss", tuple(kept))
+    return Configuration(ours.algo, PENALTY)
 
-    :param peer: preset and overrides of the other one, by default the penalty that suits all tasks
+
+def improvement(results: Results, scores: pd.DataFrame, kind: str = "ways") -> pd.DataFrame:
+    """Compares each configuration at the end with its `peer`.
+
     :return: columns ``configuration``, ``against``, ``probability``, ``low`` and ``high``
     """
     rows = []
     for ours in results.configurations:
-        other = Configuration(ours.algo, *peer).name
+        other = peer(ours, kind).name
         if other in results.names and other != ours.name:
             estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, other, 1.0))
             rows.append([ours.name, other, *estimate])
@@ -112,12 +126,14 @@ def _at(scores: pd.DataFrame, name: str, share: float) -> FloatArray:
     return values
 
 
-def _row(results: Results, scores: pd.DataFrame, name: str, reference: float) -> dict[str, str]:
+def _row(
+    results: Results, scores: pd.DataFrame, name: str, reference: float, shares: tuple[float, ...]
+) -> dict[str, str]:
     own = scores[scores["configuration"] == name]
     last = own["checkpoint"].max()
     row = {"configuration": name, "seeds": str(own["seed"].nunique())}
     digits = 3 if results.simulator in ENVIRONMENTS else 1
-    for share in SHARES:
+    for share in shares:
         values = _at(scores, name, share)
         if len(values) == 0:  # no evaluation so early
             continue

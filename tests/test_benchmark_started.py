@@ -1,0 +1,83 @@
+"""What the runs of `sb3-sap benchmark starts` begin with."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_sap.benchmark import started
+from sb3_sap.benchmark.started import DDPGAPStarted, log
+from sb3_sap.evaluation.environments import make_env
+from sb3_sap.evaluation.laps import ENVIRONMENTS
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(started, "AGENT_STEPS", 300)
+    monkeypatch.setattr(started, "LOG_STEPS", 400)
+
+
+def model(start, source="embedded"):
+    env = make_env(ENVIRONMENTS["highway"], track="wheel-2", laps=None)
+    return DDPGAPStarted(
+        "MlpPolicy", env, start=start, source=source, source_simulator="highway", seed=100, min_per_class=5, penalty=1.0
+    )
+
+
+def same(one, other):
+    return all(th.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
+
+
+@pytest.mark.slow
+def test_starts_from_an_agent():
+    donor = started.agent(started.DDPGAP, 100)
+    prepared = {start: model(start) for start in ("predictor", "policy", "policy_predictor", "replay")}
+    for one in prepared.values():
+        one._prepare()
+    assert same(prepared["policy"].policy, donor.policy)
+    assert not prepared["policy"].predictor.fitted
+    for start in ("predictor", "policy_predictor"):
+        assert same(prepared[start].predictor, donor.predictor)
+        assert prepared[start].knowledge.prior is None
+        assert prepared[start].replay_buffer.prior == ()
+    assert not same(prepared["predictor"].policy, donor.policy)
+    (prior,) = prepared["replay"].replay_buffer.prior
+    np.testing.assert_allclose(  # the donor has no penalty
+        prior.rewards[:300, 0],
+        donor.replay_buffer.rewards[:300, 0] - 1.0 * ~started_labels(donor.replay_buffer),
+        rtol=1e-4,
+    )
+
+
+def started_labels(buffer):
+    from sb3_sap.envs import ap_function
+
+    return ap_function(buffer.observations[:300, 0], None, buffer.next_observations[:300, 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["log", "random"])
+def test_starts_from_a_log(source):
+    cloned, taught = model("cloned", source), model("taught", source)
+    for one in (cloned, taught):
+        one._prepare()
+        assert one.held_until == started.HOLD
+        assert len(one.replay_buffer.prior) == 1
+    assert not cloned.predictor.fitted
+    assert cloned.knowledge.prior is None
+    assert taught.predictor.fitted
+    taught.learn(20)
+    assert taught.num_timesteps == 20
+
+
+def test_logs_are_labelled_and_reproducible():
+    one, other = log("log", "highway", 100), log("log", "highway", 100)
+    np.testing.assert_array_equal(one.obs, other.obs)
+    np.testing.assert_array_equal(one.next_obs[:-1][~one.dones[:-1]], one.obs[1:][~one.dones[:-1]])
+    wrong = log("wrong", "highway", 100)
+    assert (wrong.labels != one.labels).mean() == pytest.approx(0.1, abs=0.05)
+    assert (log("region", "highway", 100).obs[:, 1] <= 0).all()
+
+
+def test_unknown_start_is_refused():
+    with pytest.raises(ValueError, match="There is no start 'policy' from the source 'log'"):
+        model("policy", "log")

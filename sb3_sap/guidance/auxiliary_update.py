@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from numbers import Real
 from typing import Any, cast
 
@@ -23,6 +26,8 @@ FITS_AFTER_GUIDANCE = 5
 #: biases the actor.
 STEPS_BETWEEN_FITS = 15
 
+#: Networks that are held still together.
+ACTORS = ("actor", "actor_target")
 #: Networks of the policy, and those of the target that follow them.
 TARGETS = (("actor", "actor_target"), ("q_net", "q_net_target"), ("quantile_net", "quantile_net_target"))
 
@@ -73,6 +78,22 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         return due(self.refit_growth, before, now, every=FITS_AFTER_GUIDANCE if self.predictor_idle else 1)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        with self._held_still():
+            self._train(gradient_steps, batch_size)
+
+    @contextmanager
+    def _held_still(self) -> Iterator[None]:
+        """Within the block, whatever changes a taught actor that is held is undone at the end."""
+        if self.lifetime_steps > self.held_until:
+            yield
+            return
+        policy: Any = self.policy
+        held = {name: copy.deepcopy(getattr(policy, name).state_dict()) for name in ACTORS if hasattr(policy, name)}
+        yield
+        for name, state in held.items():
+            getattr(policy, name).load_state_dict(state)
+
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
         before = self._n_updates
         super().train(gradient_steps, batch_size)
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)
@@ -93,12 +114,6 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         step = permissible_value_step if self.discrete else permissible_actor_step
         return step(self if self.discrete else self.actor, self.predictor, observations, coef)
 
-    def _update_learning_rate(self, optimizers: Any) -> None:
-        super()._update_learning_rate(optimizers)
-        if self.lifetime_steps <= self.held_until:
-            for group in cast(Any, self.actor).optimizer.param_groups:
-                group["lr"] = 0.0
-
     def teach_policy(self, steps: int = 1_000, hold: int = 0) -> float:
         """Teaches the policy what is permissible, before the first step, from the actions that are known.
 
@@ -112,7 +127,10 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         :return: the mean loss of the last tenth of them
         :raise ValueError: if no permissible action is known, or for discrete actions if E was not fitted
         """
+        if steps < 1:
+            raise ValueError(f"`steps` must be at least 1, but is {steps!r}.")
         source = self.knowledge.prior or self.knowledge
+        self._begin_statistics(source)
         if source.counts("train")[PERMISSIBLE] == 0 or (self.discrete and not self.predictor.fitted):
             missing = "E is not fitted: call `fit_predictor` first" if len(source) else "nothing is known"
             raise ValueError(f"The policy cannot be taught, because {missing}.")

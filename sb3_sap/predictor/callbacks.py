@@ -84,6 +84,7 @@ class PermissibilityCallback(BaseCallback):
         sample = self.knowledge.sample(model.validation_size, "validation", model.get_vec_normalize_env())
         non_permissible, permissible = model.predictor.recall(sample)
         model.validation_accuracy = (non_permissible + permissible) / 2
+        model.describe_predictor()
         self.logger.record("sap/validation_accuracy", model.validation_accuracy)
         self.logger.record("sap/validation_accuracy_permissible", permissible)
         self.logger.record("sap/validation_accuracy_non_permissible", non_permissible)

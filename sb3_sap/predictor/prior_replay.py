@@ -137,5 +137,5 @@ def _differ(one: Any, other: Any) -> BoolArray:
     pairs = [(one[key], other[key]) for key in one] if isinstance(one, dict) else [(one, other)]
     found = np.zeros(len(pairs[0][0]), dtype=bool)
     for a, b in pairs:
-        found |= (a != b).reshape(len(a), -1).any(axis=1)
+        found |= np.any(a != b, axis=tuple(range(1, a.ndim)))
     return found

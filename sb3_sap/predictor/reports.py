@@ -80,5 +80,5 @@ class PredictorReport:
         return (
             f"Balanced accuracy {self.accuracy:.3f}{after}: permits {self.permissible:.1%} of the permissible actions, "
             f"rejects {self.non_permissible:.1%} of the mistakes; calibration error {self.calibration_error:.3f}, "
-            f"on {self.examples:,} actions that it has not learned from.{doubt}"
+            f"on {self.examples:,}{' held-out' if self.epochs else ''} actions.{doubt}"
         )

@@ -12,14 +12,16 @@ from typing import Any, Literal
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.common.arrays import BoolArray, rows_of
 from sb3_sap.common.errors import is_number
-from sb3_sap.common.vec_envs import environment_layout
+from sb3_sap.common.vec_envs import environment_layout, never_updated
 from sb3_sap.permissibility import query_labels
 from sb3_sap.predictor.building import make_knowledge, make_predictor
 from sb3_sap.predictor.fitting import fit_until_best, with_progress
-from sb3_sap.predictor.knowledge import PriorKnowledge
+from sb3_sap.predictor.knowledge import KnowledgeBuffer, PriorKnowledge
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.learned import LearnedPredictorMixin
 from sb3_sap.predictor.measuring import Familiarity
@@ -88,9 +90,18 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
 
     def save_predictor(self, path: str | Path) -> None:
         """Writes E alone, with its accuracy and the statistics of VecNormalize if there are any, for `predictor=`."""
+        if self.env is None:
+            raise ValueError(
+                "This model has no environment, so that it is not known how its observations were normalised: load it "
+                "with one, `load(path, env)`."
+            )
+        self.describe_predictor()
+        self.predictor.save(path)
+
+    def describe_predictor(self) -> None:
+        """Notes with E how accurate it is, and how its observations were normalised."""
         statistics = statistics_of(self.get_vec_normalize_env())
         self.predictor.about = {"accuracy": float(self.validation_accuracy), "statistics": statistics}
-        self.predictor.save(path)
 
     def add_knowledge(
         self, source: Any, into: Into | None = None, columns: Columns | None = None, progress_bar: bool = False
@@ -110,6 +121,7 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         if into not in (None, "knowledge", "replay", "both"):
             raise ValueError(f'`into` must be "knowledge", "replay" or "both", but is {into!r}.')
         holder = self._label_holder()
+        self._set_label_source(holder)  # a copied model has lost its AP function
         images = self.images
         batches: Iterable[Transitions] = batches_of(source, columns, images)
         if progress_bar:
@@ -162,6 +174,10 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                 f"E cannot be fitted to {few} non-permissible and permissible actions: it needs at least "
                 f"{self.min_per_class} of each class (`min_per_class`), from `add_knowledge` or `learn`."
             )
+        for name, value in (("epochs", epochs), ("patience", patience)):
+            if value < 1:
+                raise ValueError(f"`{name}` must be at least 1, but is {value!r}.")
+        self._begin_statistics(source)
         passes: Iterable[int] = range(1, epochs + 1)
         if progress_bar:
             passes = with_progress(passes, epochs)
@@ -169,10 +185,32 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
             self.predictor, source, self.dataset_size, passes, patience, self.get_vec_normalize_env()
         )
         self.validation_accuracy = report.accuracy
+        self.describe_predictor()
         self._expect_familiarity()
         return report
 
     # ---------------------------------------------------------------- an E that does not fit
+
+    def _begin_statistics(self, source: KnowledgeBuffer) -> None:
+        """Gives a VecNormalize that has seen nothing the statistics of what is known."""
+        env = self.get_vec_normalize_env()
+        if env is None or not (env.norm_obs and env.training) or not never_updated(env):
+            return
+        known = source.training_observations()
+        for key, moments in (env.obs_rms if isinstance(env.obs_rms, dict) else {"": env.obs_rms}).items():
+            moments.update(known[key])
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self.familiarity is not None and self.knowledge.newest is None:  # a loaded model has a K of its own
+            self.knowledge.newest = []
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _expect_familiarity(self) -> None:
         """From now on tests E on new labels before it learns from them."""
@@ -193,7 +231,14 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                 logits = self.predictor(obs, th.as_tensor(actions, device=self.device))
                 self.familiarity.add((logits > 0).cpu().numpy(), labels)
             self.logger.record("sap/familiarity", self.familiarity.score)
-        if self.familiarity.stale:
+        if self.familiarity.stale and self.freeze_predictor:
+            warnings.warn(
+                f"The AP predictor is frozen, but contradicts what is observed: its verdicts are right in "
+                f"{self.familiarity.score:.0%} of the cases. Let it learn, `freeze_predictor=False`, or leave it out.",
+                stacklevel=2,
+            )
+            self.familiarity = self.knowledge.newest = None
+        elif self.familiarity.stale:
             warnings.warn(
                 f"What the AP predictor learned elsewhere does not fit what is observed: its verdicts are right in "
                 f"{self.familiarity.score:.0%} of the cases. It is forgotten, and learns anew.",

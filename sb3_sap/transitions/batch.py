@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -46,6 +48,16 @@ class Transitions:
         return {name: array for name, array in found.items() if array is not None}
 
 
+@contextmanager
+def readable(path: object) -> Iterator[None]:
+    """Turns any error of a library that reads a file into a ``ValueError`` of one sentence."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} cannot be read, {type(error).__name__}: {reason}") from error
+
+
 NAMES = tuple(field.name for field in fields(Transitions))
 
 
@@ -69,9 +81,16 @@ def transitions_of(arrays: Mapping[str, Any]) -> Transitions:
         for array in value.values() if isinstance(value, dict) else [value]:
             if array.ndim == 0 or len(array) != n:
                 raise ValueError(f"`{name}` has the shape {array.shape}, but there are {n} actions: one row for each.")
+    for name in ("rewards", "dones", "truncated", "labels"):
+        if name in given and given[name].size != n:
+            raise ValueError(
+                f"`{name}` has the shape {given[name].shape}, but must have one value for each of {n} rows."
+            )
     for name in ("dones", "truncated", "labels"):
         if name in given:
-            given[name] = _as_bool(name, given[name])
+            given[name] = as_bool(name, given[name])
+    if "truncated" in given:  # what was cut off has ended
+        given["dones"] = given["truncated"] | given.get("dones", np.zeros(n, dtype=bool))
     if "rewards" in given:
         given["rewards"] = np.asarray(given["rewards"], dtype=np.float32).reshape(n)
     return Transitions(**given)
@@ -87,16 +106,24 @@ def fitting(
     :raise ValueError: if the shapes or types are not those of the spaces
     """
     n = len(batch)
+    # Before they are turned into whole numbers, which cannot be NaN.
+    finite = _finite(batch.obs, n) & _finite(batch.next_obs, n) & _finite(batch.actions, n)
     obs, next_obs = (
         _fitted(name, policy_layout(value, observation_space), observation_space, n)
         for name, value in (("obs", batch.obs), ("next_obs", batch.next_obs))
     )
     actions, inside = _fitted_actions(batch.actions, action_space, n)
-    finite = _finite(obs, n) & _finite(next_obs, n) & _finite(actions, n)
+    known = _within(obs, observation_space, n) & _within(next_obs, observation_space, n)
     if batch.rewards is not None:
         finite &= np.isfinite(batch.rewards)
-    refused = Counter({"not finite": int((~finite).sum()), "action out of bounds": int((finite & ~inside).sum())})
-    return replace(batch, obs=obs, next_obs=next_obs, actions=actions), finite & inside, refused
+    refused = Counter(
+        {
+            "not finite": int((~finite).sum()),
+            "action out of bounds": int((finite & ~inside).sum()),
+            "observation that the space does not have": int((finite & inside & ~known).sum()),
+        }
+    )
+    return replace(batch, obs=obs, next_obs=next_obs, actions=actions), finite & inside & known, refused
 
 
 def _fitted(name: str, values: Any, space: spaces.Space[Any], n: int) -> Any:
@@ -112,6 +139,8 @@ def _fitted(name: str, values: Any, space: spaces.Space[Any], n: int) -> Any:
         got = "several arrays" if isinstance(values, dict) else f"the shape {values.shape}"
         raise ValueError(f"`{name}` has {got}, but for {n} rows of {space} it must be {shape}.")
     values = values.reshape(shape)
+    if values.dtype.kind == "f":
+        values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)  # such rows are refused
     if np.issubdtype(dtype, np.integer) and not _whole(values, dtype):
         raise ValueError(
             f"`{name}` has values of type {values.dtype} that are no whole numbers of {space}: give them in the "
@@ -127,11 +156,7 @@ def _longer_than_one(shape: tuple[int, ...]) -> tuple[int, ...]:
 def _whole(values: np.ndarray[Any, Any], dtype: Any) -> bool:
     """Whether values can be of an integer type."""
     limits = np.iinfo(dtype)
-    return bool(
-        np.all(np.isfinite(values))
-        and np.all(values == np.rint(values))
-        and np.all((values >= limits.min) & (values <= limits.max))
-    )
+    return bool(np.all(values == np.rint(values)) and np.all((values >= limits.min) & (values <= limits.max)))
 
 
 def _fitted_actions(
@@ -139,19 +164,34 @@ def _fitted_actions(
 ) -> tuple[np.ndarray[Any, Any], BoolArray]:
     """(n, *action_shape) actions, those a little out of bounds put on them, and (n,) which are inside."""
     actions = _fitted("actions", actions, space, n)
-    flat = actions.reshape(n, -1)
+    if not isinstance(space, spaces.Box):
+        return actions, _within(actions, space, n)
+    flat, low, high = _flat(actions, n), space.low.reshape(-1), space.high.reshape(-1)
+    slack = TOLERANCE * (high - low)
+    inside = np.all((flat >= low - slack) & (flat <= high + slack), axis=1)
+    return np.clip(actions, space.low, space.high), inside
+
+
+def _within(values: Any, space: spaces.Space[Any], n: int) -> BoolArray:
+    """(n,) which rows a finite space has; those of a ``Box`` count as it has them."""
+    if isinstance(space, spaces.Dict):
+        parts = [_within(values[key], one, n) for key, one in space.spaces.items()]
+        return np.asarray(np.all(parts, axis=0))
     if isinstance(space, spaces.Box):
-        low, high = space.low.reshape(-1), space.high.reshape(-1)
-        slack = TOLERANCE * (high - low)
-        inside = np.all((flat >= low - slack) & (flat <= high + slack), axis=1)
-        return np.clip(actions, space.low, space.high), inside
+        return np.ones(n, dtype=bool)
+    flat = _flat(values, n)
     if isinstance(space, spaces.Discrete):
         low, high = np.array([int(space.start)]), np.array([int(space.start) + int(space.n) - 1])
     elif isinstance(space, spaces.MultiDiscrete):
         low, high = space.start.reshape(-1), (space.start + space.nvec).reshape(-1) - 1
     else:
         low, high = np.zeros(1), np.ones(1)
-    return actions, np.all((flat >= low) & (flat <= high), axis=1)
+    return np.asarray(np.all((flat >= low) & (flat <= high), axis=1))
+
+
+def _flat(values: np.ndarray[Any, Any], n: int) -> np.ndarray[Any, Any]:
+    """(n, k), also of no rows."""
+    return values.reshape(n, math.prod(values.shape[1:]))
 
 
 def _finite(values: Any, n: int) -> BoolArray:
@@ -160,11 +200,11 @@ def _finite(values: Any, n: int) -> BoolArray:
     found = np.ones(n, dtype=bool)
     for array in arrays:
         if array.dtype.kind == "f":
-            found &= np.isfinite(array.reshape(n, -1)).all(axis=1)
+            found &= np.isfinite(_flat(array, n)).all(axis=1)
     return found
 
 
-def _as_bool(name: str, values: np.ndarray[Any, Any]) -> BoolArray:
+def as_bool(name: str, values: np.ndarray[Any, Any]) -> BoolArray:
     """(n,) bool, of bool or of 0 and 1.
 
     :raise ValueError: for anything else

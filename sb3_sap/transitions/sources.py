@@ -13,7 +13,7 @@ from stable_baselines3.common.save_util import load_from_pkl
 from sb3_sap.common.arrays import joined_rows, rows_of
 from sb3_sap.common.spaces import unscaled
 from sb3_sap.common.vec_envs import environment_layout
-from sb3_sap.transitions.batch import NAMES, Transitions, transitions_of
+from sb3_sap.transitions.batch import NAMES, Transitions, readable, transitions_of
 from sb3_sap.transitions.episodes import episodes_of, is_episodes, npz_episodes
 from sb3_sap.transitions.tables import TABLES, Columns, table_batches
 
@@ -61,7 +61,7 @@ def number_of_rows(source: Any) -> int | None:
 
 def _file_batches(source: str | Path, columns: Columns | None, images: tuple[str, ...]) -> Iterator[Transitions]:
     path = Path(source)
-    if path.suffix in TABLES or path.suffix == ".gz":
+    if path.name.endswith(TABLES):
         return table_batches(path, columns)
     if not path.exists():
         if isinstance(source, str) and _is_minari_id(source):
@@ -72,7 +72,8 @@ def _file_batches(source: str | Path, columns: Columns | None, images: tuple[str
     if path.is_dir():
         return _episode_batches(path)
     if path.suffix == ".pkl":
-        loaded = load_from_pkl(path)
+        with readable(path):
+            loaded = load_from_pkl(path)
         if not isinstance(loaded, ReplayBuffer):
             raise ValueError(f"{path} holds no replay buffer of SB3 but a {type(loaded).__name__}.")
         return buffer_batches(loaded, images)
@@ -83,7 +84,9 @@ def _file_batches(source: str | Path, columns: Columns | None, images: tuple[str
 
 
 def _npz_batches(path: Path) -> Iterator[Transitions]:
-    with np.load(path) as arrays:
+    with readable(path):
+        file = np.load(path)
+    with file as arrays:
         if "acts" in arrays.files:
             yield from _episode_batches(npz_episodes(arrays))
         else:
@@ -100,7 +103,8 @@ def _minari(name: str) -> Any:
         import minari
     except ModuleNotFoundError as error:
         raise ValueError(f"{name} is a Minari data set, which needs: pip install 'sb3-sap[logs]'.") from error
-    return minari.load_dataset(name, download=True)
+    with readable(name):
+        return minari.load_dataset(name, download=True)
 
 
 def _parts(transitions: Transitions) -> Iterator[Transitions]:

@@ -11,9 +11,9 @@ import yaml
 
 from sb3_sap.common.arrays import rows_of
 from sb3_sap.common.errors import nearest
-from sb3_sap.transitions.batch import NAMES, Transitions, transitions_of
+from sb3_sap.transitions.batch import NAMES, Transitions, as_bool, readable, transitions_of
 
-TABLES = (".csv", ".parquet")
+TABLES = (".csv", ".csv.gz", ".parquet")
 #: What the columns hold, or the YAML file that says so.
 Columns: TypeAlias = Mapping[str, Any] | str | Path
 #: Rows that are read at a time.
@@ -32,7 +32,7 @@ def table_batches(path: Path, columns: Columns | None) -> Iterator[Transitions]:
     """
     names = _columns(columns)
     last: Any = None  # the last row of the piece before, whose successor is in the next piece
-    for frame in _frames(path, names):
+    for frame in filter(len, _frames(path, names)):
         frame = frame if last is None else _pandas().concat([last, frame], ignore_index=True)
         last = frame.iloc[-1:]
         yield from _followed(frame, names)
@@ -51,10 +51,9 @@ def _followed(frame: Any, names: Mapping[str, Any]) -> Iterator[Transitions]:
     after = rows_of(arrays["obs"], slice(1, None))
     arrays = {name: rows_of(array, slice(None, -1)) for name, array in arrays.items()}
     if "episode" in names:
-        episode = frame[_all(names["episode"])[0]].to_numpy()
-        changes = episode[1:] != episode[:-1]
-        dones = np.asarray(arrays.get("dones", np.zeros(n)), dtype=bool)
-        cut = np.asarray(arrays.get("truncated", np.zeros(n)), dtype=bool)
+        episode = frame[_all(names["episode"])].to_numpy()
+        changes = (episode[1:] != episode[:-1]).any(axis=1)
+        dones, cut = (as_bool(name, arrays.get(name, np.zeros(n))) for name in ("dones", "truncated"))
         arrays |= {"dones": dones | changes, "truncated": cut | (changes & ~dones)}
     if "next_obs" in names:
         yield transitions_of(arrays)
@@ -73,16 +72,38 @@ def _columns(columns: Columns | None) -> dict[str, Any]:
             "or the name of a YAML file with the same."
         )
     if isinstance(columns, (str, Path)):
-        columns = yaml.safe_load(Path(columns).read_text(encoding="utf-8"))
+        columns = _yaml(Path(columns))
     if not isinstance(columns, Mapping):
         raise ValueError(f"`columns` must map the arrays of a transition to columns, but is {columns!r}.")
-    for name in columns:
+    for name, value in columns.items():
         if name not in FIELDS:
             raise ValueError(f"`columns` has {name!r}, which no transition has: {nearest(name, FIELDS)}")
+        if not _names(value):
+            raise ValueError(
+                f"`columns` must name the columns of {name!r} as text or a list of text, but has {value!r}."
+            )
     for name in ("obs", "actions"):
         if name not in columns:
             raise ValueError(f"`columns` must name those of `{name}`.")
     return dict(columns)
+
+
+def _yaml(path: Path) -> Any:
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no file {path}.")
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from error
+
+
+def _names(value: Any) -> bool:
+    """Whether a value names columns: text, a list of text, or such a value for each key of an observation."""
+    if isinstance(value, Mapping):
+        return bool(value) and all(map(_names, value.values()))
+    return isinstance(value, str) or (
+        isinstance(value, list | tuple) and bool(value) and all(isinstance(one, str) for one in value)
+    )
 
 
 def _pandas() -> Any:
@@ -108,14 +129,19 @@ def _frames(path: Path, names: Mapping[str, Any]) -> Iterator[Any]:
             import pyarrow.parquet as pq
         except ModuleNotFoundError as error:
             raise ValueError(f"{path} is a Parquet table, which needs: pip install 'sb3-sap[logs]'.") from error
-        with pq.ParquetFile(path) as file:
+        with readable(path):
+            file = pq.ParquetFile(path)
+        with file:
             _check_columns(path, needed, file.schema_arrow.names)
             for batch in file.iter_batches(ROWS, columns=needed):
                 yield batch.to_pandas()
         return
     pandas = _pandas()
-    _check_columns(path, needed, list(pandas.read_csv(path, nrows=0).columns))
-    with pandas.read_csv(path, usecols=needed, chunksize=ROWS) as chunks:
+    # Without `index_col` pandas takes the first column for an index where rows end with a comma.
+    with readable(path):
+        header = pandas.read_csv(path, nrows=0, index_col=False)
+    _check_columns(path, needed, list(header.columns))
+    with pandas.read_csv(path, usecols=needed, chunksize=ROWS, index_col=False) as chunks:
         yield from chunks
 
 

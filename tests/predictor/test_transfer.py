@@ -144,7 +144,7 @@ def test_interrupted_import_leaves_the_model_as_it_was(monkeypatch):
             raise KeyboardInterrupt
         return towards_centre(obs, actions, next_obs)
 
-    model.replay_buffer.ap_function = interrupted
+    model.ap_function = interrupted
     with pytest.raises(KeyboardInterrupt):
         model.add_knowledge(line_log(50))
     assert calls == [10, 10, 10]
@@ -534,3 +534,90 @@ def test_donor_of_another_algorithm_and_its_own_buffer():
     assert report.rows == 80 == report.into_replay
     batch = joined(list(batches_of(donor.replay_buffer)))
     assert report.permissible == towards_centre(batch.obs, batch.actions, batch.next_obs).sum()
+
+
+# ------------------------------------------------------------------ where silence would be wrong
+
+
+def test_copied_model_labels_and_penalises():
+    model = copy.deepcopy(build(SACAP, ap_function=towards_centre, penalty=5.0))
+    model.add_knowledge(line_log(100), into="replay")
+    assert model.replay_buffer.prior[0].rewards.min() < -5
+
+
+def test_single_row_is_taken():
+    model = build(SACAP, ap_function=towards_centre)
+    assert model.add_knowledge(line_log(1)).into_replay == 1
+    assert model.replay_buffer.prior[0].dones[0, 0] == 1
+
+
+def test_predictor_object_knows_its_accuracy_and_normalisation():
+    env = VecNormalize(make_vec_env(Line), norm_reward=False)
+    model, _ = known(env=env)
+    model.fit_predictor()
+    with pytest.raises(ValueError, match="has no VecNormalize"):
+        build(SACAP, predictor=model.predictor, predictor_kwargs={})
+    donor = fitted()
+    assert build(SACAP, predictor=donor.predictor, predictor_kwargs={}).validation_accuracy == donor.validation_accuracy
+
+
+def test_statistics_of_a_fresh_vecnormalize_are_those_of_the_log():
+    env = VecNormalize(make_vec_env(Line), norm_reward=False)
+    log = line_log()
+    log["obs"][:, 1] += 500
+    log["next_obs"][:, 1] += 500
+    model, _ = known(env=env, log=log)
+    assert model.fit_predictor().accuracy > 0.85
+    assert env.obs_rms.mean[1] == pytest.approx(500.5, abs=1)
+
+
+def test_model_without_environment_does_not_write_a_predictor(tmp_path):
+    build(DDPGAP, VecNormalize(make_vec_env(Line))).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="has no environment"):
+        DDPGAP.load(tmp_path / "model").save_predictor(tmp_path / "e.pt")
+
+
+def test_policy_can_be_taught_again_while_it_is_held():
+    model, _ = known(t_k=0, learning_starts=0)
+    model.fit_predictor()
+    model.teach_policy(10, hold=100)
+    model.learn(20)
+    before = copy.deepcopy(model.actor.state_dict())
+    model.teach_policy(50)
+    assert not all(th.equal(value, before[name]) for name, value in model.actor.state_dict().items())
+
+
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_held_policy_acts_the_same(algorithm):
+    model, _ = known(algorithm, t_k=0, learning_starts=0)
+    model.fit_predictor()
+    model.teach_policy(10, hold=100)
+    obs = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
+    before = model.predict(obs, deterministic=True)[0]
+    model.learn(30)
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], before)
+
+
+def test_loaded_model_goes_on_testing_its_predictor(tmp_path):
+    model = build(DDPGAP, predictor=fitted().predictor, predictor_kwargs={}, t_k=0, learning_starts=0)
+    model.save(tmp_path / "model")
+    loaded = DDPGAP.load(tmp_path / "model", Line())
+    loaded.learn(60)
+    assert loaded.familiarity.score > 0.5
+    assert sum(map(len, loaded.familiarity._right.values())) == 60
+
+
+def test_frozen_predictor_that_contradicts_is_told_and_stays():
+    model, _ = known(log=line_log(wrong=True), t_k=0, learning_starts=0, freeze_predictor=True)
+    model.fit_predictor()
+    before = copy.deepcopy(model.predictor.state_dict())
+    with pytest.warns(UserWarning, match="is frozen, but contradicts"):
+        model.learn(150)
+    assert all(th.equal(value, before[name]) for name, value in model.predictor.state_dict().items())
+
+
+@pytest.mark.parametrize("call", [lambda m: m.fit_predictor(epochs=0), lambda m: m.teach_policy(steps=0)])
+def test_numbers_of_at_least_one(call):
+    model, _ = known()
+    with pytest.raises(ValueError, match="must be at least 1"):
+        call(model)

@@ -109,3 +109,23 @@ def test_what_is_wrong_with_arrays_is_said(change, sentence):
 def test_wrong_number_of_values_is_said():
     with pytest.raises(ValueError, match=r"`obs` has the shape \(4, 3\)"):
         fitting(transitions_of(arrays(obs=np.zeros((4, 3)))), SPACE, ACTIONS)
+
+
+def test_nan_where_whole_numbers_belong_is_refused_row_by_row():
+    actions = np.array([0.0, np.nan, 2.0, 1.0])
+    batch, sound, _ = fitting(transitions_of(arrays(actions=actions)), SPACE, spaces.Discrete(3))
+    assert sound.tolist() == [True, False, True, True]
+    assert batch.actions.tolist() == [0, 0, 2, 1]
+
+
+def test_observation_that_a_finite_space_does_not_have_is_refused():
+    given = arrays(obs=np.array([0, 1, 5, 2]), next_obs=np.array([0, 1, 2, 3]))
+    _, sound, refused = fitting(transitions_of(given), spaces.Discrete(3), ACTIONS)
+    assert sound.tolist() == [True, True, False, False]
+    assert refused["observation that the space does not have"] == 2
+
+
+@pytest.mark.parametrize("name", ["rewards", "labels"])
+def test_one_value_for_each_row(name):
+    with pytest.raises(ValueError, match="one value for each of 4 rows"):
+        transitions_of(arrays(**{name: np.zeros((4, 2))}))

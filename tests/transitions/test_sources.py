@@ -262,3 +262,75 @@ def test_folder_without_trajectories(tmp_path):
 def test_reading_imports_neither_imitation_nor_minari():
     code = "import sys, sb3_sap; print({'imitation', 'minari', 'pyarrow', 'pandas'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+# ------------------------------------------------------------------ what a newcomer's files look like
+
+
+def test_trailing_commas_do_not_shift_the_columns(tmp_path):
+    (tmp_path / "log.csv").write_text("x,t,a,r,z\n1,2,0.3,4,0,\n5,6,0.7,8,0,\n9,1,0.1,2,0,\n", encoding="utf-8")
+    batch = whole(tmp_path / "log.csv", columns={"obs": ["x", "t"], "actions": "a", "rewards": "r"})
+    np.testing.assert_allclose(batch.obs, [[1, 2], [5, 6]])
+    np.testing.assert_allclose(batch.actions, [0.3, 0.7])
+    np.testing.assert_allclose(batch.rewards, [4, 8])
+
+
+@pytest.mark.parametrize("flags", [{"dones": "end", "truncated": "cut"}, {"truncated": "cut"}])
+def test_what_was_cut_off_has_ended(tmp_path, flags):
+    """Else the next observation of the last step is the first one of the next episode."""
+    frame = pd.DataFrame({"x": [1.0, 2, 3, 10, 11], "a": 0.0, "end": 0, "cut": [0, 0, 1, 0, 0]})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    batch = whole(tmp_path / "log.csv", columns={"obs": "x", "actions": "a", **flags})
+    np.testing.assert_array_equal(batch.next_obs - batch.obs, [1, 1, 1])
+
+
+def test_several_columns_may_tell_the_episode(tmp_path):
+    frame = pd.DataFrame({"x": [1.0, 2, 10, 11], "a": 0.0, "driver": "me", "run": [1, 1, 2, 2]})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    columns = {"obs": "x", "actions": "a", "episode": ["driver", "run"]}
+    assert whole(tmp_path / "log.csv", columns=columns).next_obs.tolist() == [2, 11]
+
+
+def test_flag_that_is_neither_true_nor_false_is_an_error_with_episodes_too(tmp_path):
+    pd.DataFrame({"x": [1.0, 2, 3], "a": 0.0, "d": [0, 2, np.nan], "run": 1}).to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(ValueError, match="`dones` must be True or False"):
+        whole(tmp_path / "log.csv", columns={"obs": "x", "actions": "a", "dones": "d", "episode": "run"})
+
+
+@pytest.mark.parametrize("more", [{}, {"episode": "run"}, {"next_obs": "y"}])
+def test_table_without_rows_gives_nothing(tmp_path, more):
+    (tmp_path / "log.csv").write_text("x,a,y,run\n", encoding="utf-8")
+    assert list(batches_of(tmp_path / "log.csv", {"obs": "x", "actions": "a", **more})) == []
+
+
+def test_flag_in_a_list_of_one_column(tmp_path):
+    frame = pd.DataFrame({"x": [1.0, 2, 3], "a": 0.0, "d": [0, 1, 0], "run": 1})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    columns = {"obs": ["x"], "actions": ["a"], "dones": ["d"], "episode": ["run"]}
+    assert whole(tmp_path / "log.csv", columns=columns).obs.tolist() == [[1.0]]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("log.csv", b""), ("log.parquet", b"PAR1"), ("log.npz", b"PK"), ("log.pkl", b"x"), ("log.pkl.gz", b"x")],
+)
+def test_broken_file_is_one_sentence_with_its_name(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")) as error:
+        whole(tmp_path / name, columns={"obs": "x", "actions": "a"})
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("columns", [{"obs": 3, "actions": "a"}, {"obs": "x", "actions": "a", "episode": None}])
+def test_columns_are_named_by_text(tmp_path, columns):
+    (tmp_path / "log.csv").write_text("x,a\n1,2\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="must name the columns of"):
+        whole(tmp_path / "log.csv", columns=columns)
+
+
+def test_broken_yaml_is_one_sentence(tmp_path):
+    (tmp_path / "log.csv").write_text("x,a\n1,2\n", encoding="utf-8")
+    (tmp_path / "columns.yml").write_text("obs: [x\nactions: }", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"columns\.yml is no YAML") as error:
+        whole(tmp_path / "log.csv", columns=tmp_path / "columns.yml")
+    assert "\n" not in str(error.value)

@@ -9,6 +9,7 @@ PPO, where the ratio is 1; PPOAP uses the last one.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -51,7 +52,8 @@ def reward(actions: np.ndarray) -> np.ndarray:
 def estimates(mean: float, n: int, error: float, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
     """Mean and standard deviation of each estimate of the gradient, from one action."""
     space = spaces.Box(-1, 1, (1,))
-    guide = Guide(Above(), space, n, squashed=False, device=th.device("cpu"))
+    judge: Any = Above()
+    guide = Guide(judge, space, n, squashed=False, device=th.device("cpu"))
     distribution = DiagGaussianDistribution(1).proba_distribution(
         th.full((SAMPLES, 1), mean), th.full((SAMPLES, 1), float(np.log(SIGMA)))
     )

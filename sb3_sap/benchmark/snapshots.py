@@ -145,7 +145,11 @@ def filled_part(buffer: Any) -> dict[str, Any]:
 def fill(buffer: Any, attributes: Mapping[str, Any]) -> None:
     """Writes what :func:`filled_part` returned into an empty buffer of the same size."""
 
+    n = buffer.buffer_size if attributes["full"] else attributes["pos"]
+
     def write(own: Any, saved: Any) -> Any:
+        if own is None and isinstance(saved, np.ndarray) and len(saved) == n:  # the buffer makes it with its first row
+            own = np.zeros((buffer.buffer_size, *saved.shape[1:]), saved.dtype)
         if isinstance(own, np.ndarray) and isinstance(saved, np.ndarray) and len(own) == buffer.buffer_size:
             own[: len(saved)] = saved
             return own

@@ -338,6 +338,7 @@ def test_taught_policy_is_held_while_the_critics_learn(algorithm):
     assert not all(th.equal(value, before[name]) for name, value in model.actor.state_dict().items())
 
 
+@pytest.mark.slow
 def test_stochastic_policy_learns_how_much_the_actions_vary():
     rng, log = np.random.default_rng(0), line_log()
     log["actions"] = np.clip(-np.sign(log["obs"][:, :1]) * rng.normal(0.6, 0.05, (2_000, 1)), -1, 1)
@@ -379,6 +380,7 @@ def test_wrong_knowledge_is_noticed_and_unlearned():
     assert left > 0.5 > right
 
 
+@pytest.mark.slow
 def test_right_knowledge_is_kept():
     model, _ = known(t_k=0, learning_starts=0)
     model.fit_predictor(epochs=6)

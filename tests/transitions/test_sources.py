@@ -1,8 +1,5 @@
 """Each kind of source gives the transitions that were made."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -257,11 +254,6 @@ def test_what_is_no_source_is_said(source, error, sentence):
 def test_folder_without_trajectories(tmp_path):
     with pytest.raises(ValueError, match=r"holds no trajectories"):
         whole(tmp_path)
-
-
-def test_reading_imports_neither_imitation_nor_minari():
-    code = "import sys, sb3_sap; print({'imitation', 'minari', 'pyarrow', 'pandas'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
 
 
 # ------------------------------------------------------------------ what a newcomer's files look like

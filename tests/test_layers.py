@@ -150,20 +150,8 @@ def test_importing_the_package_loads_no_simulator_and_no_plotting():
     """
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     new = output.split()
-    heavy = (
-        "pygame",
-        "highway_env",
-        "matplotlib",
-        "pandas",
-        "scipy",
-        "PIL",
-        "rl_zoo3",
-        "optuna",
-        "rich",
-        "moviepy",
-        "minari",
-        "pyarrow",
-    )
+    plotting = ("pygame", "highway_env", "matplotlib", "pandas", "scipy", "PIL", "moviepy")
+    heavy = (*plotting, "rl_zoo3", "optuna", "rich", "minari", "pyarrow")
     assert "sb3_sap.algorithms" in new
     assert [name for name in new if name.split(".")[0] in heavy] == []
     # Of the package itself, it loads what training needs, and neither commands nor the benchmark.

@@ -5,6 +5,7 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import textwrap
 from pathlib import Path
 
@@ -193,6 +194,11 @@ def test_commands_run_as_printed(tmp_path, monkeypatch):
     env = gym.make("sap/LaneKeeping-v0", laps=None)
     DDPGAP("MlpPolicy", env, seed=1).learn(300).save("wheel2")
     assert main(["demo", "--steps", "300", "--no-animation"]) == 0
+    # The page on logs writes its log in Python, and prints the file of its columns.
+    exec(SNIPPETS["logs.md"][0], {})
+    shutil.copy("log.csv", "other.csv")
+    (columns,) = re.findall(r"```yaml\n(.*?)```", TEXTS["logs.md"], re.DOTALL)
+    Path("columns.yml").write_text(columns, encoding="utf-8")
     ran = []
     for _, command in dict.fromkeys(COMMANDS):
         arguments = shlex.split(command)[1:]
@@ -201,7 +207,7 @@ def test_commands_run_as_printed(tmp_path, monkeypatch):
             continue
         assert main(arguments) == 0, command
         ran.append(arguments[0])
-    assert {"evaluate", "push-to-hub"} <= set(ran)
+    assert {"evaluate", "predictor", "push-to-hub"} <= set(ran)
 
 
 # ---------------------------------------------------------------- nothing is left out

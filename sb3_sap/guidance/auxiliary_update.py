@@ -55,8 +55,8 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
     ):
         self.actor_permissibility_coef: Any = actor_permissibility_coef
         self.teaching_growth = teaching_growth
-        #: Timestep, counted like ``t_k``, up to which a taught actor stays as it is.
-        self.held_until = 0
+        #: Timestep, counted like ``t_k``, up to which a taught actor stays as it is; -1: it does not.
+        self.held_until = -1
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -148,5 +148,5 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         for own, target in TARGETS:
             if getattr(self, own, None) is not None and getattr(self, target, None) is not None:
                 getattr(self, target).load_state_dict(getattr(self, own).state_dict())
-        self.held_until = 0 if self.discrete else self.lifetime_steps + hold
+        self.held_until = self.lifetime_steps + hold if hold > 0 and not self.discrete else -1
         return float(np.mean(losses[-max(1, steps // 10) :]))

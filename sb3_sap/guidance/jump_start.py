@@ -106,7 +106,7 @@ class JumpStartMixin(SettingsMixin):
         """(n_envs,) where the guide's action is executed."""
         obs, _ = self.policy.obs_to_tensor(cast(Any, self._last_obs))
         if isinstance(self.action_space, spaces.Discrete):
-            greedy = np.asarray(self.policy.predict(cast(Any, self._last_obs), deterministic=True)[0])
+            greedy = np.asarray(self.predict(cast(Any, self._last_obs), deterministic=True)[0])  # within the masks
             return np.asarray(own != greedy.reshape(own.shape))
         values = [
             q_values(self, obs, th.as_tensor(actions.reshape(len(actions), -1), device=self.device)).cpu().numpy()

@@ -55,7 +55,7 @@ class PermissibilityCallback(BaseCallback):
             self.logger.record_mean("sap/permissible_rate", new[PERMISSIBLE] / new.sum())
         if not self._warned and sum(knowledge.seen) >= CONSTANT_LABELS_WARNING and min(knowledge.seen) == 0:
             self._warn_of_constant_labels(knowledge.seen)
-        if knowledge.newest is not None:
+        if self.model.familiarity is not None:
             self.model.test_familiarity()
         if not getattr(self.model, "fits_in_train", False):
             n_envs = self.model.n_envs

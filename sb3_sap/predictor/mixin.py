@@ -81,6 +81,7 @@ class LearnedPermissibilityMixin(PriorKnowledgeMixin, SettingsMixin):
 
     def _set_label_source(self, holder: Labels) -> None:
         super()._set_label_source(holder)
+        cast(KnowledgeMixin, holder).prior_share = self.prior_share
         for buffer in getattr(holder, "prior", ()):
             super()._set_label_source(buffer)
             buffer.reward_scale = holder.reward_scale

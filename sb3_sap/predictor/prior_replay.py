@@ -83,7 +83,6 @@ class PriorReplay:
             self._last[5][:] |= ~ended
             self._write(self._last)
         self._own.prior = (*self._own.prior, *self._buffers)
-        self._own.prior_share = self.model.prior_share
         self._own.reward_scale = self._scale
         return self._pieces
 

@@ -12,8 +12,6 @@ from typing import Any, Literal
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.common.arrays import BoolArray, rows_of
 from sb3_sap.common.errors import is_number
@@ -149,7 +147,6 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
             raise ValueError(f"All {rows} transitions were refused: {reasons}.")
         if into != "replay" and len(prior) > 0:
             self.knowledge.prior = prior  # type: ignore[assignment]
-            self.knowledge.prior_share = self.prior_share
             self._expect_familiarity()
         kept = len(prior) if into != "replay" else 0
         pieces = 0 if replay is None else replay.attach()
@@ -200,18 +197,6 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         for key, moments in (env.obs_rms if isinstance(env.obs_rms, dict) else {"": env.obs_rms}).items():
             moments.update(known[key])
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        if self.familiarity is not None and self.knowledge.newest is None:  # a loaded model has a K of its own
-            self.knowledge.newest = []
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-
     def _expect_familiarity(self) -> None:
         """From now on tests E on new labels before it learns from them."""
         self.familiarity = Familiarity()
@@ -221,7 +206,7 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
     def test_familiarity(self) -> None:
         """Tests an E of elsewhere on the newest labels; one that does not fit is forgotten, with what it came from."""
         newest, self.knowledge.newest = self.knowledge.newest, []
-        if self.familiarity is None or not newest:
+        if self.familiarity is None or not newest:  # the K of a loaded model has not collected any yet
             return
         normalize = self.get_vec_normalize_env()
         # One that does not even predict what it came from proves nothing.
@@ -255,6 +240,10 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         self.validation_accuracy = float("nan")
 
     # ---------------------------------------------------------------- hooks and helpers
+
+    def _set_label_source(self, holder: Labels) -> None:
+        super()._set_label_source(holder)
+        holder.knowledge.prior_share = self.prior_share
 
     def _label_holder(self) -> Labels:
         """What knows where labels come from."""

@@ -352,6 +352,30 @@ def test_stochastic_policy_learns_how_much_the_actions_vary():
     assert drawn.std() == pytest.approx(0.05, abs=0.05)
 
 
+def test_actor_that_was_not_taught_or_is_not_held_learns_before_the_first_step():
+    model, _ = known()
+    model.add_knowledge(line_log(100), into="replay")
+    model._setup_learn(1)
+    for taught in (False, True):
+        if taught:
+            model.teach_policy(1)
+        before = copy.deepcopy(model.actor.state_dict())
+        model.train(gradient_steps=1, batch_size=8)
+        assert not all(th.equal(value, before[name]) for name, value in model.actor.state_dict().items())
+
+
+def test_share_of_old_transitions_may_be_changed_by_load(tmp_path):
+    model, _ = known()
+    model.add_knowledge(line_log(200) | {"rewards": np.full(200, 77.0)}, into="replay")
+    model.learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = DDPGAP.load(tmp_path / "model", Line(), prior_share=0.25)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.knowledge.prior_share == 0.25
+    assert (loaded.replay_buffer.sample(40).rewards == 77).float().mean() == 0.25
+
+
 def test_policy_cannot_be_taught_by_nothing():
     with pytest.raises(ValueError, match="nothing is known"):
         build(DDPGAP).teach_policy()

@@ -33,7 +33,8 @@ from sb3_sap.predictor.callbacks import PermissibilityCallback
 
 PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
-    *("td3:fast[teaching_growth=null]", "sac:fast[teaching_growth=0]"),
+    *("ddpg:base+loss", "td3:base+loss", "sac:base+loss", "tqc:base+loss"),
+    *("ddpg:base+penalty", "td3:base+penalty", "sac:base+penalty", "tqc:base+penalty"),
 )
 #: Bases for ``--bare``; those with discrete actions learn MountainCar, the others lane keeping on TORCS.
 BARE = ("ddpg", "td3", "sac", "tqc", "crossq", "dqn", "qrdqn")
@@ -78,6 +79,15 @@ def build_bare(algo: str) -> Any:
     return cls("MlpPolicy", gym.make("sap/TorcsLaneKeeping-v0", track="wheel-2", laps=None), seed=100)
 
 
+def see_the_whole(model: Any, steps: int) -> None:
+    """Schedules see the whole training, not the chunk of it that is being measured."""
+
+    def update(done: int, _: int) -> None:
+        model._current_progress_remaining = 1 - done / steps
+
+    model._update_current_progress_remaining = update
+
+
 def products_of_a_batch(predictor: Any, repeats: int = 200) -> float:
     """Seconds of the matrix products in one gradient step of E: forward, and backward by weights and by inputs."""
     layers = [layer.weight.detach() for layer in predictor.head if isinstance(layer, th.nn.Linear)]
@@ -102,6 +112,8 @@ def measure(pair: str, steps: int) -> dict[str, object]:
         guided = Configuration(f"{base.algo}_ap", base.preset, base.overrides)
         settings = settings_of(guided, "torcs", steps)
         models = [build(algo, settings) for algo in (base.algo, guided.algo)]
+    for model in models:
+        see_the_whole(model, steps)
     spent = [0.0, 0.0]
     seconds.clear()
     for done in range(0, steps, CHUNK):

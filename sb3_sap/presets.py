@@ -6,9 +6,8 @@ import re
 from importlib import resources
 from typing import Any
 
-import yaml
-
 from sb3_sap.common.errors import is_number, nearest
+from sb3_sap.common.yaml_text import read_yaml
 
 #: Keys of an RL Zoo configuration that RL Zoo reads itself; all others are arguments of the constructor.
 RUNNER_KEYS = frozenset(
@@ -43,7 +42,7 @@ def load_config(algo: str) -> dict[str, dict[str, Any]]:
     """All entries of an algorithm's YAML file."""
     _check("algo", algo, algorithms())
     text = (resources.files("sb3_sap") / "zoo_configs" / f"{algo}.yml").read_text(encoding="utf-8")
-    entries: dict[str, dict[str, Any]] = yaml.safe_load(text)
+    entries: dict[str, dict[str, Any]] = read_yaml(text)
     return entries
 
 

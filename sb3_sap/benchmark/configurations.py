@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from sb3_sap.benchmark.groups import GROUPS
+from sb3_sap.common.yaml_text import read_yaml
 
 #: ``algo``, ``algo:preset`` or ``algo:preset[key=value,…]``.
 _CONFIGURATION = re.compile(r"(?P<algo>\w+)(:(?P<preset>\w+(\+\w+)*))?(\[(?P<overrides>.+)\])?")
@@ -46,14 +47,14 @@ class Configuration:
     @property
     def changes(self) -> dict[str, Any]:
         """Values of the overridden settings by dotted name."""
-        return {key: yaml.safe_load(value) for key, value in self.overrides if key not in RUN_OPTIONS}
+        return {key: read_yaml(value) for key, value in self.overrides if key not in RUN_OPTIONS}
 
     def run_option(self, name: str, default: int) -> int:
         """The value of one of `RUN_OPTIONS`, or the default.
 
         :raise ValueError: if the value is not a whole number of 1 or more
         """
-        value = yaml.safe_load(dict(self.overrides).get(name, str(default)))
+        value = read_yaml(dict(self.overrides).get(name, str(default)))
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"In the configuration {self.name}, {name} must be 1 or more, but is {value!r}.")
         return value
@@ -104,12 +105,7 @@ def _split(text: str) -> list[str]:
 def _value(text: str) -> str:
     """Rewrites a YAML value as JSON, in which a value has one spelling; a word remains as it is."""
     try:
-        value: Any = yaml.safe_load(text)
+        value: Any = read_yaml(text)
     except yaml.YAMLError:
         raise ValueError(f"{text!r} is not a value as YAML writes it.") from None
-    if isinstance(value, str):
-        try:
-            value = float(value)  # YAML reads 1e-3 as a word
-        except ValueError:
-            return str(value)
-    return json.dumps(value, separators=(",", ":"))
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))

@@ -7,12 +7,12 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 from rich.table import Table
 
 from sb3_sap.algorithms import ALGORITHMS, is_guided
 from sb3_sap.common.command_line import not_negative, positive
+from sb3_sap.common.yaml_text import read_yaml
 
 
 def add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def _mapping(text: str) -> dict[str, Any]:
-    value = yaml.safe_load(text)
+    value = read_yaml(text)
     if not isinstance(value, dict):
         raise argparse.ArgumentTypeError(f"must be a YAML mapping such as '{{gamma: 0.95}}', but is {text!r}")
     return value

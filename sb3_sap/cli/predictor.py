@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import yaml
 from gymnasium import spaces
 from rich.console import Console
 from rich.table import Table
@@ -16,6 +15,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_sap.algorithms import DDPGAP, DQNAP
 from sb3_sap.common.command_line import not_negative, positive
 from sb3_sap.common.extractors import RescaleExtractor
+from sb3_sap.common.yaml_text import read_yaml
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.onpolicy.algorithms import PPOAP
 from sb3_sap.predictor.measuring import measure
@@ -56,7 +56,7 @@ def _command(actions: Any, name: str, text: str, run: Any) -> argparse.ArgumentP
 def _add_labels(command: argparse.ArgumentParser) -> None:
     """Adds the options that say what the transitions are of, and which of them are permissible."""
     command.add_argument("--env", required=True, metavar="ENV_ID", help="environment of the transitions")
-    command.add_argument("--env-kwargs", type=yaml.safe_load, default={}, metavar="YAML", help="its arguments")
+    command.add_argument("--env-kwargs", type=read_yaml, default={}, metavar="YAML", help="its arguments")
     command.add_argument("--ap-function", metavar="MODULE.FUNCTION", help="f(s, a | s'); by default labels of the log")
     command.add_argument("--columns", type=Path, metavar="FILE", help="YAML file that names the columns of a table")
 

@@ -61,7 +61,11 @@ class PermissibilityLossMixin(AuxiliaryLossMixin):
 
     @property
     def predictor_idle(self) -> bool:
-        return super().predictor_idle and self._current_coef == 0
+        if self._current_coef > 0:
+            return False
+        # A schedule that has fallen to 0 leaves E without use where α is 0 as well.
+        faded = self.permissibility_coef != 0 and self.alpha == 0 and self.actor_permissibility_coef == 0
+        return faded or super().predictor_idle
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self._current_coef == 0 or not self.predictor_accurate:

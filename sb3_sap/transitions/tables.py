@@ -11,6 +11,7 @@ import yaml
 
 from sb3_sap.common.arrays import rows_of
 from sb3_sap.common.errors import nearest
+from sb3_sap.common.yaml_text import read_yaml
 from sb3_sap.transitions.batch import NAMES, Transitions, as_bool, readable, transitions_of
 
 TABLES = (".csv", ".csv.gz", ".parquet")
@@ -92,7 +93,7 @@ def _yaml(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"There is no file {path}.")
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return read_yaml(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from error
 

@@ -108,6 +108,16 @@ def test_coefficient_may_fade_earlier():
     assert coefs == pytest.approx([2.0, 1.0, 0.0, 0.0])
 
 
+def test_predictor_is_fitted_rarely_once_nothing_learns_from_it():
+    model = build(SACAP, alpha=0.0, permissibility_coef="lin_1.0_0.5")
+    model._current_progress_remaining = 0.6
+    assert model.refits_due(100, 110) == 10
+    model._current_progress_remaining = 0.4
+    assert model.refits_due(100, 110) == 2
+    model.alpha = 0.9  # guidance still asks it
+    assert model.refits_due(100, 110) == 10
+
+
 @pytest.mark.parametrize("value", [-0.1, float("nan")])
 def test_negative_coefficient_is_refused(value):
     with pytest.raises(ValueError, match=r"^`permissibility_coef` must be at least 0, but is "):

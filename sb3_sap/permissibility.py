@@ -21,7 +21,8 @@ class APFunction(Protocol):
     :param obs: s, raw (never normalised) observations, (n, *obs_shape)
     :param actions: a, in the units of the environment's action space, (n, *action_shape)
     :param next_obs: s', the true next observations (never those after an automatic reset), (n, *obs_shape)
-    :return: (n,) bool, True where the action was permissible
+    :return: (n,) bool, True where the action was permissible; with ``action_parts`` (n, k), one label for each of k
+        parts
     """
 
     def __call__(self, obs: Observations, actions: np.ndarray[Any, Any], next_obs: Observations, /) -> BoolArray: ...
@@ -69,8 +70,10 @@ class ActionPermissibility(gym.Wrapper[Any, Any, Any, Any]):
         if self.shaping:
             reward = float(reward)
             self.reward_scale.update(reward)
-            if not labels_from_infos([info])[0]:
-                reward -= self.shaping.penalty_at(float(self.reward_scale))
+            label = np.asarray(info.get("permissible"))
+            parts = tuple(map(str, range(label.size))) if label.ndim == 1 else ()
+            [added] = self.shaping.of_labels(labels_from_infos([info], parts), float(self.reward_scale))
+            reward += float(added)
         self._obs = copy_observation(next_obs)
         return next_obs, reward, terminated, truncated, info
 
@@ -89,7 +92,12 @@ def does_not_lower(potential: Callable[[Observations], FloatArray]) -> APFunctio
 
 
 def query_labels(
-    function: Callable[..., Any], argument: str, obs: Observations, actions: np.ndarray[Any, Any], *next_obs: Any
+    function: Callable[..., Any],
+    argument: str,
+    obs: Observations,
+    actions: np.ndarray[Any, Any],
+    *next_obs: Any,
+    parts: tuple[str, ...] = (),
 ) -> BoolArray:
     """Calls a user's function with a batch of actions and checks the labels that it returns.
 
@@ -97,10 +105,11 @@ def query_labels(
     :param obs: s, raw, (n, *obs_shape)
     :param actions: a, in the environment's units, (n, *action_shape)
     :param next_obs: s', for functions that take it
-    :return: (n,) bool
+    :param parts: names of the parts of the action that have labels of their own
+    :return: (n,) bool, with parts (n, k)
     :raise RuntimeError: if the function raises an error
     :raise TypeError: if the labels are not bool
-    :raise ValueError: if their shape is not (n,)
+    :raise ValueError: if their shape is another
     """
     name = getattr(function, "__name__", repr(function))
     n = len(actions)
@@ -118,19 +127,24 @@ def query_labels(
     if labels.dtype != np.bool_:
         what = "NaN" if labels.dtype.kind == "f" and np.isnan(labels).any() else f"values of type {labels.dtype}"
         raise TypeError(f"`{argument}` {name} returned {what}, but must return bool: True where permissible.")
-    if labels.shape != (n,):
+    shape = (n, len(parts)) if parts else (n,)
+    if labels.shape != shape:
+        each = f" and each of the `action_parts` {', '.join(parts)}" if parts else ""
+        several = labels.ndim == 2 and argument == "ap_function" and not parts
+        hint = ". Labels of parts of the action need `action_parts`" if several else ""
         raise ValueError(
             f"`{argument}` {name} returned an array of shape {labels.shape} for {n} actions, but must return "
-            f"shape ({n},): one label for each row of the batch."
+            f"shape {shape}: one label for each row of the batch{each}{hint}."
         )
     return labels
 
 
-def labels_from_infos(infos: list[dict[str, Any]]) -> BoolArray:
+def labels_from_infos(infos: list[dict[str, Any]], parts: tuple[str, ...] = ()) -> BoolArray:
     """Collects the labels that environments or :class:`ActionPermissibility` put into ``info["permissible"]``.
 
     :param infos: one ``info`` of each environment
-    :return: (n_envs,) bool
+    :param parts: names of the parts of the action that have labels of their own
+    :return: (n_envs,) bool, with parts (n_envs, k)
     """
     for info in infos:
         if "permissible" not in info:
@@ -138,6 +152,8 @@ def labels_from_infos(infos: list[dict[str, Any]]) -> BoolArray:
                 'There is no AP function: the environment puts no "permissible" into `info`. Pass `ap_function=` '
                 "to the algorithm, or wrap the environment in `ActionPermissibility(env, function)`."
             )
-        if not isinstance(info["permissible"], (bool, np.bool_)):
-            raise TypeError(f'`info["permissible"]` must be a bool, but is {info["permissible"]!r}.')
+        found = np.asarray(info["permissible"])
+        if found.dtype != np.bool_ or found.shape != ((len(parts),) if parts else ()):
+            wanted = f"an array of {len(parts)} bool, one for each of {', '.join(parts)}," if parts else "a bool,"
+            raise TypeError(f'`info["permissible"]` must be {wanted} but is {info["permissible"]!r}.')
     return np.array([info["permissible"] for info in infos], dtype=bool)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_sap.check.advice import advise
 from sb3_sap.check.classifier import ClassifierResult, fit_classifier
+from sb3_sap.check.parts import InfoOfPart, OfPart
 from sb3_sap.check.report import PermissibilityReport
 from sb3_sap.check.trials import label, rollout, try_actions
+from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import stack_observations
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.spaces import check_action_space, check_observation_space
@@ -26,7 +28,8 @@ def check_permissibility(
     n_steps: int = 2_000,
     seed: int = 0,
     verbose: bool = True,
-) -> PermissibilityReport:
+    action_parts: Mapping[str, Sequence[int]] | None = None,
+) -> PermissibilityReport | dict[str, PermissibilityReport]:
     """Tries an AP function with random actions and, if one is given, with a good policy.
 
     The environment is stepped ``n_steps`` times with random actions, and as often with the policy. Further steps return
@@ -41,7 +44,9 @@ def check_permissibility(
     :param n_steps: random steps, at least 100
     :param seed: of all random draws
     :param verbose: whether to print the report
-    :return: the report as data
+    :param action_parts: as the algorithms take them; each part is checked by itself, so that it takes as many times as
+        many steps
+    :return: the report as data; with ``action_parts`` one for each of them, by name
     :raise ValueError: for an environment that cannot be used, labels that are missing or of a wrong shape
     :raise TypeError: for labels that are not bool
     """
@@ -54,6 +59,16 @@ def check_permissibility(
     check_action_space("check_permissibility", env.action_space, discrete=None)
     check_observation_space("check_permissibility", env.observation_space)
     function = None if ap_function is None else resolve(ap_function, "ap_function")
+    if action_parts is not None:
+        names = ActionParts.of(action_parts, env.action_space).names
+        reports = {}
+        for number, name in enumerate(names):
+            if verbose:
+                print(f"{name}:")
+            of_part = None if function is None else OfPart(function, names, number)
+            judged = InfoOfPart(env, names, number) if function is None else env
+            reports[name] = check_permissibility(judged, of_part, policy, n_steps, seed, verbose)
+        return cast(dict[str, PermissibilityReport], reports)
     act = None if policy is None else _action_function(policy, env.action_space)
     env.action_space.seed(seed)
     transitions = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)

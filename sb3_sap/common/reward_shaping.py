@@ -90,6 +90,11 @@ class RewardShaping:
             return float(self.penalty)
         return scale * float(self.penalty.removeprefix("auto").removeprefix("_") or 1)
 
+    def of_labels(self, labels: BoolArray, scale: float = 1.0) -> FloatArray:
+        """(n,) minus c for each mistake among (n,) labels, or among (n, k) labels of k parts of the action."""
+        mistakes = ~labels
+        return -self.penalty_at(scale) * (mistakes.sum(axis=1) if mistakes.ndim > 1 else mistakes)
+
     def difference(
         self,
         labels: BoolArray | None,
@@ -100,7 +105,8 @@ class RewardShaping:
     ) -> FloatArray:
         """What is added to the rewards of n transitions.
 
-        :param labels: (n,) False where the action was a mistake; None: there are no labels, and no penalty
+        :param labels: (n,) False where the action was a mistake, or (n, k) for k parts of it; None: there are no
+            labels, and no penalty
         :param obs: s, raw, (n, *obs_shape)
         :param next_obs: s', raw, (n, *obs_shape)
         :param terminal: (n,) True where the episode terminated, False where it goes on or was truncated
@@ -109,7 +115,7 @@ class RewardShaping:
         """
         added = np.zeros(len(terminal))
         if labels is not None:
-            added -= self.penalty_at(scale) * ~labels
+            added += self.of_labels(labels, scale)
         if self.potential is not None:
             later, now = (query_potential(self.potential, o, len(terminal)) for o in (next_obs, obs))
             added += self.gamma * np.where(terminal, 0.0, later) - now

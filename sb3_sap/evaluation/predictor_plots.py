@@ -20,21 +20,25 @@ UNBOUNDED = 1e6
 
 
 @th.no_grad()
-def permissible_probability(model: Any, obs: Observations, actions: np.ndarray[Any, Any]) -> FloatArray:
+def permissible_probability(
+    model: Any, obs: Observations, actions: np.ndarray[Any, Any], part: str | None = None
+) -> FloatArray:
     """E's probability that an action is permissible, for m actions in each of n states.
 
     :param model: a guided model
     :param obs: (n, *obs_shape) raw observations, or one such array per key
     :param actions: (n, m, *action_shape), or (m, *action_shape) for every state, in the environment's units
+    :param part: of the action, one of ``action_parts``; ``None``: the action as a whole
     :return: (n, m)
     """
     tensors, _ = model.policy.obs_to_tensor(_normalised(model, obs))
     features = model.predictor.features(tensors)
+    number = None if part is None else model.parts.names.index(part)
     shape = model.action_space.shape
     scaled = actions if isinstance(model.action_space, spaces.Discrete) else model.policy.scale_action(actions)
     if actions.ndim == len(shape) + 1:
         scaled = np.repeat(scaled[None], len(features), axis=0)
-    logits = query_candidates(model.predictor, features, scaled.reshape(*scaled.shape[:2], -1))
+    logits = query_candidates(model.predictor, features, scaled.reshape(*scaled.shape[:2], -1), number)
     return np.asarray(1 / (1 + np.exp(-logits.astype(np.float64))))
 
 
@@ -125,7 +129,10 @@ def draw_permissibility(axis: Axes, model: Any, values: FloatArray, obs: Observa
         heights = np.linspace(space.low.flat[action], space.high.flat[action], RESOLUTION)
         tried = np.repeat(chosen.reshape(len(values), 1, -1), RESOLUTION, axis=1)
         tried[:, :, action] = heights
-        probability = permissible_probability(model, obs, tried.reshape(*tried.shape[:2], *space.shape))
+        # With parts of the action the verdict is on the one that is drawn.
+        named = zip(model.parts.names, model.parts.indices, strict=True)
+        part = next((name for name, indices in named if action in indices), None)
+        probability = permissible_probability(model, obs, tried.reshape(*tried.shape[:2], *space.shape), part)
         picked, style = chosen.reshape(len(values), -1)[:, action], "k-"
         axis.set_ylim(heights[0], heights[-1])
     image = axis.pcolormesh(values, heights, probability.T, cmap="RdYlGn", vmin=0, vmax=1, shading="nearest")

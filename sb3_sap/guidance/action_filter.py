@@ -9,7 +9,7 @@ import torch as th
 
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
-from sb3_sap.guidance.candidates import candidate_actions, choose
+from sb3_sap.guidance.candidates import candidate_actions, choose, only_in
 from sb3_sap.guidance.masks import check_statistics
 from sb3_sap.predictor.network import query_candidates
 
@@ -54,23 +54,34 @@ def guided_prediction(
     if not model.discrete:
         proposed = model.policy.scale_action(proposed)
     flat = proposed.reshape(len(proposed), -1)
-    ones = np.ones_like(flat[:1])
-    candidates = candidate_actions(np.random.default_rng(0), model.action_space, -ones, ones, model.n_candidates)
-    candidates = candidates.repeat(len(flat), axis=0)  # the same for every state of a batch
-    # The proposal itself comes first and is its own nearest candidate.
-    candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
-    permissible = model.allowed_candidates(raw, candidates)
-    if model.predictor.fitted:
-        permissible &= query_candidates(model.predictor, model.predictor.features(obs), candidates) > 0
-    found = permissible.any(axis=1)
-    if not found.any():
-        return actions
-    distance = np.linalg.norm(candidates - flat[:, None], axis=2)
-    flat = flat.copy()
-    flat[found] = choose(model.exploration_rng, candidates[found], permissible[found], -distance[found])
+    for part in range(len(model.parts)) if model.parts else (None,):
+        flat = _repaired(model, obs, raw, flat, part)
     changed = (flat != proposed.reshape(flat.shape)).any(axis=1)
     if not changed.any():
         return actions
     guided = np.array(actions).reshape(proposed.shape)
     guided[changed] = model.unscale_actions(flat.reshape(proposed.shape))[changed]
     return guided.reshape(np.shape(actions))
+
+
+def _repaired(
+    model: GuidedExplorationMixin, obs: Any, raw: Any, flat: np.ndarray[Any, Any], part: int | None
+) -> np.ndarray[Any, Any]:
+    """(n, action_dim) scaled actions, of which a rejected part, or with None the whole, is replaced."""
+    ones = np.ones_like(flat[:1])
+    candidates = candidate_actions(np.random.default_rng(0), model.action_space, -ones, ones, model.n_candidates)
+    candidates = candidates.repeat(len(flat), axis=0)  # the same for every state of a batch
+    if part is not None:
+        candidates = only_in(flat, model.parts.indices[part], candidates)
+    # The proposal itself comes first and is its own nearest candidate.
+    candidates = np.concatenate([flat[:, None], candidates.astype(flat.dtype)], axis=1)
+    permissible = model.allowed_candidates(raw, candidates)
+    if model.predictor.fitted:
+        permissible &= query_candidates(model.predictor, model.predictor.features(obs), candidates, part) > 0
+    found = permissible.any(axis=1)
+    if not found.any():
+        return flat
+    distance = np.linalg.norm(candidates - flat[:, None], axis=2)
+    flat = flat.copy()
+    flat[found] = choose(model.exploration_rng, candidates[found], permissible[found], -distance[found])
+    return flat

@@ -82,22 +82,37 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         :param actions: (n_envs, *action_shape) the actor's actions, scaled
         :return: the same with rejected ones replaced; None where nothing changed
         """
-        shape, n_envs = actions.shape, len(actions)
-        actions = actions.reshape(n_envs, -1)
-        self.logger.record("sap/alpha", self.current_alpha)
-        consulted = np.flatnonzero(self.exploration_rng.random(n_envs) < self.current_alpha)  # line 5
+        shape = actions.shape
+        guided = actions.reshape(len(actions), -1)
+        changed = False
+        for part in range(len(self.parts)) if self.parts else (None,):
+            repaired = self._guide_part(guided, part)
+            if repaired is not None:
+                guided, changed = repaired, True
+        return guided.reshape(shape) if changed else None
+
+    def _guide_part(self, actions: np.ndarray[Any, Any], part: int | None) -> np.ndarray[Any, Any] | None:
+        """The same for one part of the action, whose other dimensions remain; None: for the whole action.
+
+        :param actions: (n_envs, action_dim), scaled
+        """
+        n_envs = len(actions)
+        alpha = self._alpha_of(part)
+        self.logger.record("sap/alpha", alpha)
+        consulted = np.flatnonzero(self.exploration_rng.random(n_envs) < alpha)  # line 5
         self.logger.record_mean("sap/consultation_rate", len(consulted) / n_envs)
         if len(consulted) == 0:
             return None
         obs, _ = self.policy.obs_to_tensor(cast(Any, self._last_obs))
         features = self.predictor.features(obs)
-        logits = query_candidates(self.predictor, features[consulted], actions[consulted, None])[:, 0]  # line 6
+        logits = query_candidates(self.predictor, features[consulted], actions[consulted, None], part)[:, 0]  # line 6
         rejected = consulted[logits <= 0]  # line 7
         self.logger.record_mean("sap/rejection_rate", len(rejected) / len(consulted))
         if len(rejected) == 0:
             return None
-        candidates, allowed = self.sample_candidates(rejected, n_envs)  # line 8
-        candidate_verdicts = query_candidates(self.predictor, features[rejected], candidates)
+        others = None if part is None else (actions[rejected], self.parts.indices[part])
+        candidates, allowed = self.sample_candidates(rejected, n_envs, others)  # line 8
+        candidate_verdicts = query_candidates(self.predictor, features[rejected], candidates, part)
         permissible = allowed & (candidate_verdicts > 0)  # line 9
         found = permissible.any(axis=1)  # line 10
         self.logger.record_mean("sap/fallback_rate", 1 - found.mean())
@@ -107,7 +122,7 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         scores = self._scores(rows_of(obs, rows), actions[rows], candidates[found], candidate_verdicts[found])
         guided = actions.copy()
         guided[rows] = choose(self.exploration_rng, candidates[found], permissible[found], scores)  # line 11
-        return guided.reshape(shape)  # lines 12-14
+        return guided  # lines 12-14
 
     def _scores(self, obs: Any, actions: Any, candidates: Any, logits: FloatArray) -> FloatArray | None:
         """What ``candidate_selection`` maximises, (m, N); None for a random choice."""
@@ -137,7 +152,11 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
     @property
     def current_alpha(self) -> float:
         """α, or at most ``alpha_low`` while E is not accurate enough (section 4.3)."""
-        return self.alpha if self.predictor_accurate else min(self.alpha_low, self.alpha)
+        return self._alpha_of(None)
+
+    def _alpha_of(self, part: int | None) -> float:
+        accurate = self.predictor_accurate if part is None else bool(self.predictor.trusted[part])
+        return self.alpha if accurate else min(self.alpha_low, self.alpha)
 
     def _setup_model(self) -> None:
         for name in ("alpha", "alpha_low"):

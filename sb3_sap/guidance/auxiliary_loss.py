@@ -27,13 +27,33 @@ def permissible_actor_step(actor: Any, predictor: PermissibilityPredictor, obser
     :param coef: β
     :return: the loss before the step
     """
-    loss = coef * F.softplus(-predictor(observations, mean_action(actor, observations))).mean()
+    loss = coef * rejection(predictor, observations, mean_action(actor, observations))
     actor.optimizer.zero_grad()
     trained = [parameter for parameter in actor.parameters() if parameter.requires_grad]  # some may be frozen
     if trained:
         loss.backward(inputs=trained)  # type: ignore[no-untyped-call]
     actor.optimizer.step()
     return loss.item()
+
+
+def rejection(predictor: PermissibilityPredictor, observations: Any, actions: th.Tensor) -> th.Tensor:
+    """softplus(−E(s, a)) on average, which has a gradient towards permissible actions.
+
+    With parts it is the sum over the parts that are accurate enough, and each has a gradient in its own dimensions
+    alone: a wrong pedal must not move the steering.
+
+    :param observations: n observation tensors
+    :param actions: (n, action_dim), scaled
+    """
+    if not predictor.parts:
+        return F.softplus(-predictor(observations, actions)).mean()
+    features, total = predictor.features(observations), actions.new_zeros(())
+    for number in th.where(predictor.trusted)[0].tolist():
+        own = th.zeros(actions.shape[1], dtype=th.bool, device=actions.device)
+        own[list(predictor.parts.indices[number])] = True
+        logits = predictor.part_logits(features, th.where(own, actions, actions.detach()))[:, number]
+        total = total + F.softplus(-logits).mean()
+    return total
 
 
 @flush_denormals()

@@ -45,6 +45,15 @@ def stratified_candidates(rng: np.random.Generator, low: FloatArray, high: Float
     return (low[:, None] + unit * (high - low)[:, None]).astype(np.float32)
 
 
+def only_in(
+    actions: np.ndarray[Any, Any], dimensions: tuple[int, ...], candidates: np.ndarray[Any, Any]
+) -> np.ndarray[Any, Any]:
+    """(m, n, action_dim) candidates for m actions, which they equal but in some dimensions."""
+    kept = np.ones(actions.shape[1], dtype=bool)
+    kept[list(dimensions)] = False
+    return np.where(kept, actions[:, None], candidates)
+
+
 def choose(
     rng: np.random.Generator, candidates: np.ndarray[Any, Any], permissible: BoolArray, scores: FloatArray | None
 ) -> np.ndarray[Any, Any]:

@@ -10,11 +10,10 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
-from torch.nn import functional as F
 
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.common.torch_utils import flush_denormals
-from sb3_sap.guidance.auxiliary_loss import mean_action, preference_loss
+from sb3_sap.guidance.auxiliary_loss import mean_action, preference_loss, rejection
 from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
 from sb3_sap.guidance.values import q_values
 
@@ -91,7 +90,7 @@ class PermissibilityLossMixin(AuxiliaryLossMixin):
         else:
             if self._n_updates % MEASURED_EVERY == 0 or self.q_spread == 0:
                 self._measure_spread(observations)
-            own = F.softplus(-self.predictor(observations, mean_action(self.actor, observations))).mean()
+            own = rejection(self.predictor, observations, mean_action(self.actor, observations))
             loss = self._current_coef * self.q_spread * own
         for module, training in modes.items():
             module.training = training

@@ -80,6 +80,7 @@ class LearnedPermissibility(ActionPermissibility):
         check_at_least(self, n_candidates=1, dataset_size=2, min_per_class=1)
         check_action_space(type(self).__name__, self.action_space, discrete=None)
         check_observation_space(type(self).__name__, self.observation_space)
+        self._refuse_parts((predictor_kwargs or {}).get("action_parts"))
         self._discrete = isinstance(self.action_space, spaces.Discrete)
         dim = int(np.prod(self.action_space.shape or (1,)))
         self.knowledge = KnowledgeBuffer(self.observation_space, dim, knowledge_buffer_size, seed=seed)
@@ -95,10 +96,17 @@ class LearnedPermissibility(ActionPermissibility):
 
     def _take_over(self, given: PermissibilityPredictor | str | Path) -> None:
         given = PermissibilityPredictor.load(given, "cpu") if isinstance(given, (str, Path)) else copy.deepcopy(given)
+        self._refuse_parts(given.parts)
         check_same_spaces(given, self.observation_space, self.action_space)
         check_statistics(given.about.get("statistics"), None)
         self.predictor = given
         self.validation_accuracy = float(given.about.get("accuracy", float("nan")))
+
+    def _refuse_parts(self, parts: Any) -> None:
+        if parts:
+            raise ValueError(
+                f"{type(self).__name__} judges the action as a whole: use an algorithm of sb3_sap for `action_parts`."
+            )
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         obs, executed = self._obs, self._permitted(action)

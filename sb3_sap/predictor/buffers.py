@@ -131,7 +131,8 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
         labels = None
         if self.ap_function is not None:
             actions = unscaled(self.action_space, raw.actions.cpu().numpy())
-            labels = query_labels(self.ap_function, "ap_function", before, actions, after)
+            parts = self.knowledge.part_names
+            labels = query_labels(self.ap_function, "ap_function", before, actions, after, parts=parts)
         terminal = raw.dones.cpu().numpy().ravel() > 0
         added = self.shaping.difference(labels, before, after, terminal, float(self.reward_scale)).reshape(-1, 1)
         rewards = self._normalize_reward((raw.rewards.cpu().numpy() + added).astype(np.float32), env)
@@ -220,6 +221,11 @@ def check_fits(loaded: ReplayBuffer, model: Any) -> None:
         raise ValueError(
             f"The file holds a {type(loaded).__name__}, but this model uses a {type(own).__name__}: load the model "
             "with the `replay_buffer_class` of the buffer."
+        )
+    if loaded.knowledge.part_names != own.knowledge.part_names:
+        raise ValueError(
+            f"The file holds labels of the parts {loaded.knowledge.part_names}, but this model has "
+            f"{own.knowledge.part_names}: build the model with the `action_parts` of the buffer."
         )
     for name in ("observation_space", "action_space"):
         if getattr(loaded, name) != getattr(model, name):

@@ -14,9 +14,10 @@ from sb3_sap.common.extractors import with_extractor
 from sb3_sap.common.random import make_rng
 from sb3_sap.common.torch_utils import own_generators
 from sb3_sap.predictor.buffers import KnowledgeMixin, guided_buffer_class
-from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.knowledge import KnowledgeBuffer, PriorKnowledge
 from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.optimizer_state import settings_of
+from sb3_sap.predictor.parted import PartedKnowledge, PartedPriorKnowledge
 
 #: Arguments whose defaults are the policy's, so that E extracts features from observations as the policy does.
 SHARED = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
@@ -28,6 +29,7 @@ ARCHITECTURE = (
     "features_extractor_kwargs",
     "normalize_images",
     "optimizer_class",
+    "action_parts",
 )
 #: Keys that a hindsight replay buffer needs in an observation.
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -46,10 +48,11 @@ def make_predictor(
     own = with_extractor(model.predictor_kwargs)
     if "features_extractor_class" in own:  # the arguments of the policy's extractor would not fit it
         own = {"features_extractor_kwargs": {}, **own}
-    arguments = {name: getattr(model.policy, name) for name in SHARED} | own
+    of_parts = {} if model.action_parts is None else {"action_parts": model.parts.as_dict()}
+    arguments = {name: getattr(model.policy, name) for name in SHARED} | own | of_parts
     known = inspect.signature(PermissibilityPredictor).parameters
     if given is not None:
-        arguments = given.arguments | own
+        arguments = given.arguments | own | of_parts
         saved = {name: described(given.arguments[name]) for name in ARCHITECTURE}
     for name in arguments.keys() - known.keys():
         raise TypeError(
@@ -80,12 +83,13 @@ def make_predictor(
     return predictor, architecture
 
 
-def make_knowledge(model: Any, kind: type[KnowledgeBuffer] = KnowledgeBuffer) -> KnowledgeBuffer:
+def make_knowledge(model: Any, prior: bool = False) -> KnowledgeBuffer:
     """An empty K of the model's size.
 
+    :param prior: one for what is known from elsewhere
     :raise ValueError: if it has no room for ``min_per_class`` examples of each class
     """
-    knowledge = kind(
+    settings = (
         model.observation_space,
         int(np.prod(model.action_space.shape or (1,))),
         model.knowledge_buffer_size,
@@ -93,6 +97,11 @@ def make_knowledge(model: Any, kind: type[KnowledgeBuffer] = KnowledgeBuffer) ->
         model.seed,
         model.min_per_class,
     )
+    knowledge: KnowledgeBuffer
+    if model.parts:
+        knowledge = (PartedPriorKnowledge if prior else PartedKnowledge)(model.parts.names, *settings)
+    else:
+        knowledge = (PriorKnowledge if prior else KnowledgeBuffer)(*settings)
     room = knowledge.parts["train"].capacity // 2
     if model.min_per_class > room:
         raise ValueError(

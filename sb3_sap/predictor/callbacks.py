@@ -84,6 +84,8 @@ class PermissibilityCallback(BaseCallback):
         sample = self.knowledge.sample(model.validation_size, "validation", model.get_vec_normalize_env())
         non_permissible, permissible = model.predictor.recall(sample)
         model.validation_accuracy = (non_permissible + permissible) / 2
+        for name, accuracy in zip(model.parts.names, model.predictor.accuracies if model.parts else (), strict=True):
+            self.logger.record(f"sap/validation_accuracy_{name}", float(accuracy))
         model.describe_predictor()
         self.logger.record("sap/validation_accuracy", model.validation_accuracy)
         self.logger.record("sap/validation_accuracy_permissible", permissible)

@@ -30,7 +30,7 @@ class LabelledActions(NamedTuple):
 
     observations: Observations  # (n, *obs_shape)
     actions: np.ndarray[Any, Any]  # (n, action_dim), scaled to [-1, 1]
-    labels: FloatArray  # (n,) 1 where permissible, else 0
+    labels: FloatArray  # (n,) 1 where permissible, else 0; with labels per part of the action (n, k), NaN: not known
 
 
 class KnowledgeBuffer:
@@ -48,6 +48,8 @@ class KnowledgeBuffer:
     :param min_per_class: tuples of each class, in each part, for which a full K makes room at the other class's cost
     """
 
+    #: The parts of the action that have labels of their own; none: a label is of the whole action.
+    part_names: tuple[str, ...] = ()
     #: Tuples of each class that a part must have before it is used beside `prior`.
     min_per_class: int = 1
     #: What is known from elsewhere; None: nothing.

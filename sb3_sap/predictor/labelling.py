@@ -69,25 +69,29 @@ def take_in(
     :param action: scaled, (n, *action_shape)
     :param reward: of the environment, (n,)
     :param done: (n,) whether the episode ended
-    :return: (n,) the labels and (n,) what is added to the rewards; ``None``: there are none, nothing is added
+    :return: (n,) the labels, of all parts of the action together, and (n,) what is added to the rewards; ``None``:
+        there are none, nothing is added
     """
     for i, info in enumerate(infos):
         if RAW_LAST in info:
             set_row(next_obs, i, info[RAW_LAST])
     before, after = (environment_layout(o, holder.images) for o in (obs, next_obs))
     labels: BoolArray | None = None
+    parts = holder.knowledge.part_names
     if holder.ap_function is not None:
-        labels = query_labels(holder.ap_function, "ap_function", before, unscaled(action_space, action), after)
+        executed = unscaled(action_space, action)
+        labels = query_labels(holder.ap_function, "ap_function", before, executed, after, parts=parts)
     elif holder.needs_labels or any("permissible" in info for info in infos):
-        labels = labels_from_infos(infos)
+        labels = labels_from_infos(infos, parts)
     if labels is not None:
         holder.knowledge.add(obs, action.reshape(len(labels), -1), labels)
     holder.reward_scale.update(reward)
+    of_all = labels if labels is None or not parts else np.asarray(labels.all(axis=1))
     if not holder.shaping:
-        return labels, None
+        return of_all, None
     truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
     terminal = np.asarray(done, dtype=bool) & ~truncated
-    return labels, holder.shaping.difference(labels, before, after, terminal, float(holder.reward_scale))
+    return of_all, holder.shaping.difference(labels, before, after, terminal, float(holder.reward_scale))
 
 
 def set_row(observations: Any, row: int, obs: Any) -> None:

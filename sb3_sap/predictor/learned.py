@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch as th
@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback
 
+from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.reward_shaping import Potential, RewardShaping
@@ -35,7 +36,11 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
     :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
         to the reward that is learned from alone, and without an ``ap_function`` an action is permissible if it does
         not lower Φ
-    :param knowledge_buffer_size: capacity of K
+    :param action_parts: names of parts of the action with their dimensions, such as ``{"steering": [0], "pedal":
+        [1]}``, which have labels of their own: the AP function then returns (n, k), ``info["permissible"]`` holds (k,)
+        bool, and a part that E rejects is replaced alone. A penalty is subtracted once for each part. ``None``: the
+        action is labelled as a whole
+    :param knowledge_buffer_size: capacity of K, with parts for each of them
     :param validation_fraction: share of K kept for validation
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
     :param validation_size: size of the balanced validation sample
@@ -51,6 +56,7 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         ap_function: APFunction | str | None = None,
         penalty: float | str = 0.0,
         potential: Potential | str | None = None,
+        action_parts: Mapping[str, Sequence[int]] | None = None,
         knowledge_buffer_size: int = 10_000,
         validation_fraction: float = 0.1,
         dataset_size: int = 512,
@@ -62,6 +68,7 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         self.ap_function = ap_function
         self.penalty = penalty
         self.potential = potential
+        self.action_parts = action_parts
         self.knowledge_buffer_size = knowledge_buffer_size
         self.validation_fraction = validation_fraction
         self.dataset_size = dataset_size
@@ -79,6 +86,15 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
 
     def _check_knowledge_settings(self) -> None:
         check_at_least(self, knowledge_buffer_size=4, min_per_class=1, dataset_size=2, validation_size=2)
+        if self.parts and self.ap_function is None and self.potential is not None:
+            raise ValueError(
+                "`potential` labels the action as a whole: with `action_parts` give an `ap_function` for each part."
+            )
+
+    @property
+    def parts(self) -> ActionParts:
+        """The parts of the action that have labels of their own; none without ``action_parts``."""
+        return ActionParts.of(self.action_parts, self.action_space)
 
     def _setup_model(self) -> None:
         self._check_knowledge_settings()
@@ -123,7 +139,11 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
 
     @property
     def predictor_accurate(self) -> bool:
-        """Whether E passed the gate of section 4.3 on its last validation sample."""
+        """Whether E, or its output for any part of the action, passed the gate of section 4.3 on its last validation
+        sample.
+        """
+        if self.parts:
+            return bool(self.predictor.trusted.any())
         return self.validation_accuracy >= SUFFICIENT_ACCURACY
 
     # ---------------------------------------------------------------- saving

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
@@ -18,6 +18,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import FloatArray, Observations
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.common.vec_envs import policy_layout
@@ -34,6 +35,9 @@ class PermissibilityPredictor(BaseModel):
     Its inputs are observations as the policy gets them, and actions scaled to [-1, 1], or one-hot if they are discrete
     (in each dimension of a ``MultiDiscrete``); those of a ``MultiBinary`` are as they are.
 
+    With ``action_parts`` it has an output for each of k parts of the action, over shared layers, each of which sees the
+    whole action. The logit of the action is then the lowest of the parts that are accurate enough.
+
     :param observation_space: of the environment
     :param action_space: of the environment
     :param net_arch: hidden layers; the paper's are 128 and 256
@@ -46,10 +50,12 @@ class PermissibilityPredictor(BaseModel):
     :param features_extractor_class: as in SB3's policies; E owns its extractor
     :param features_extractor_kwargs: its arguments
     :param normalize_images: as in SB3's policies
+    :param action_parts: names of parts of the action with their dimensions, which have labels of their own
     """
 
     features_extractor: BaseFeaturesExtractor
     n_updates: th.Tensor
+    accuracies: th.Tensor  # (k,) balanced validation accuracy of each part, NaN before the first validation
 
     def __init__(
         self,
@@ -65,6 +71,7 @@ class PermissibilityPredictor(BaseModel):
         features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
+        action_parts: Mapping[str, Sequence[int]] | None = None,
     ):
         if isinstance(optimizer_class, str):
             found = getattr(th.optim, optimizer_class, None)
@@ -84,21 +91,25 @@ class PermissibilityPredictor(BaseModel):
             optimizer_kwargs=optimizer_kwargs,
         )
         self.batch_size = batch_size
+        self.parts = ActionParts.of(action_parts, action_space)
         self._arguments = {
             "net_arch": list(net_arch),
             "activation_fn": activation_fn,
             "learning_rate": learning_rate,
             "weight_decay": weight_decay,
             "batch_size": batch_size,
+            "action_parts": self.parts.as_dict(),
         }
         self.features_extractor = self.make_features_extractor()
         n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
-        self.head = nn.Sequential(*create_mlp(n_inputs, 1, list(net_arch), activation_fn))
+        self.head = nn.Sequential(*create_mlp(n_inputs, len(self.parts) or 1, list(net_arch), activation_fn))
         self._normalises_batches = any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in self.modules())
         # Seeds the random layers, such as dropout, of each fit.
         self._seed = th.initial_seed()
         # Buffers are saved with the weights: a loaded E knows whether it was ever fitted.
         self.register_buffer("n_updates", th.zeros((), dtype=th.long))
+        if self.parts:
+            self.register_buffer("accuracies", th.full((len(self.parts),), th.nan))
         # The gradient of the L2 term λ/2 ‖θ_E‖² is λ θ_E, which torch.optim calls weight decay.       # Eq. (7)
         self.optimizer = optimizer_class(
             self.parameters(),
@@ -137,7 +148,7 @@ class PermissibilityPredictor(BaseModel):
         return read_predictor(cls, path, device, **arguments)  # type: ignore[no-any-return]
 
     def probabilities(self, obs: Observations, actions: np.ndarray[Any, Any]) -> FloatArray:
-        """(n,) probabilities that n actions are permissible.
+        """(n,) probabilities that n actions are permissible; with k parts of the action, (n, k).
 
         :param obs: (n, *obs_shape), as the policy gets them: normalised if it learned so
         :param actions: (n, *action_shape), in the environment's units
@@ -148,8 +159,9 @@ class PermissibilityPredictor(BaseModel):
             scaled = 2.0 * (scaled - low) / (high - low) - 1.0
         with th.no_grad():
             tensor = th.as_tensor(scaled.reshape(len(scaled), -1), device=self.device)
-            logits = self(obs_as_tensor(policy_layout(obs, self.observation_space), self.device), tensor)
-        return th.sigmoid(logits).cpu().numpy()
+            features = self.features(obs_as_tensor(policy_layout(obs, self.observation_space), self.device))
+            found = th.sigmoid(self.part_logits(features, tensor)).cpu().numpy()
+        return found if self.parts else found[:, 0]
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -167,18 +179,38 @@ class PermissibilityPredictor(BaseModel):
         return self.extract_features(obs, self.features_extractor)
 
     def logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """(n,) logits of (n, action_dim) scaled actions; above zero means permissible."""
+        """(n,) logits of (n, action_dim) scaled actions; above zero means permissible.
+
+        With parts, an action is permissible unless a part that is accurate enough is not.
+        """
+        of_parts = self.part_logits(features, actions)
+        if not self.parts:
+            return of_parts.squeeze(1)
+        return of_parts.masked_fill(~self.trusted, th.inf).min(dim=1).values
+
+    def part_logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """(n, k) logits that each of k parts of the action is permissible; without parts (n, 1)."""
         actions = _encoded(self.action_space, actions)
         # A float64 action space brings float64 actions.
-        return self.head(th.cat([features, actions.to(features.dtype)], dim=1)).squeeze(1)  # type: ignore[no-any-return]
+        return self.head(th.cat([features, actions.to(features.dtype)], dim=1))  # type: ignore[no-any-return]
+
+    @property
+    def trusted(self) -> th.Tensor:
+        """(k,) which parts are accurate enough, each as the whole action is without parts (section 4.3)."""
+        return self.accuracies >= SUFFICIENT_ACCURACY
 
     def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of n observations and (n, action_dim) scaled actions."""
         return self.logits(self.features(obs), actions)
 
     def loss(self, obs: Any, actions: th.Tensor, labels: th.Tensor) -> th.Tensor:
-        """Binary cross-entropy of (n,) labels in {0, 1}; the optimizer adds the L2 term."""
-        return F.binary_cross_entropy_with_logits(self(obs, actions), labels)  # Eq. (7)
+        """Binary cross-entropy of (n,) labels in {0, 1}, or of those that are known of (n, k); the optimizer adds the
+        L2 term.
+        """
+        if not self.parts:
+            return F.binary_cross_entropy_with_logits(self(obs, actions), labels)  # Eq. (7)
+        known = ~labels.isnan()
+        return F.binary_cross_entropy_with_logits(self.part_logits(self.features(obs), actions)[known], labels[known])
 
     @flush_denormals()
     def fit(self, dataset: LabelledActions) -> float:
@@ -220,11 +252,23 @@ class PermissibilityPredictor(BaseModel):
     @th.no_grad()
     @flush_denormals()
     def recall(self, dataset: LabelledActions) -> tuple[float, float]:
-        """E's recall of each class, (non-permissible, permissible); their mean is the balanced accuracy."""
+        """E's recall of each class, (non-permissible, permissible); their mean is the balanced accuracy.
+
+        With parts, the means over those that the dataset has labels of, whose accuracies are noted.
+        """
         obs, actions, labels = self._to_tensors(dataset)
-        correct = ((self(obs, actions) > 0) == (labels > 0.5)).cpu().numpy()
-        permissible = dataset.labels > 0.5
-        return float(correct[~permissible].mean()), float(correct[permissible].mean())
+        of_parts = self.part_logits(self.features(obs), actions)
+        labels = labels.reshape(of_parts.shape)
+        recalls = []
+        for number in th.where(~labels.isnan().all(dim=0))[0].tolist():
+            known = ~labels[:, number].isnan()
+            permissible = labels[known, number] > 0.5
+            correct = ((of_parts[known, number] > 0) == permissible).double()
+            recalls.append((correct[~permissible].mean().item(), correct[permissible].mean().item()))
+            if self.parts:
+                self.accuracies[number] = sum(recalls[-1]) / 2
+        non_permissible, of_permissible = np.mean(recalls, axis=0)
+        return float(non_permissible), float(of_permissible)
 
     def _to_tensors(self, dataset: LabelledActions) -> tuple[Any, th.Tensor, th.Tensor]:
         obs: Any = obs_as_tensor(dataset.observations, self.device)
@@ -252,15 +296,20 @@ def _encoded(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:
 
 
 def query_candidates(
-    predictor: PermissibilityPredictor, features: th.Tensor, candidates: np.ndarray[Any, Any]
+    predictor: PermissibilityPredictor,
+    features: th.Tensor,
+    candidates: np.ndarray[Any, Any],
+    part: int | None = None,
 ) -> FloatArray:
     """E's logits of n candidates in each of m states, in one call.
 
     :param features: (m, features_dim)
     :param candidates: (m, n, action_dim), scaled
+    :param part: the part of the action that is judged; None: the whole
     :return: (m, n)
     """
     m, n, dim = candidates.shape
     actions = th.as_tensor(candidates.reshape(m * n, dim), device=features.device)
-    logits = predictor.logits(features.repeat_interleave(n, dim=0), actions)
+    repeated = features.repeat_interleave(n, dim=0)
+    logits = predictor.logits(repeated, actions) if part is None else predictor.part_logits(repeated, actions)[:, part]
     return logits.cpu().numpy().reshape(m, n)

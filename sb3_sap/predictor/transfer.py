@@ -19,7 +19,7 @@ from sb3_sap.common.vec_envs import environment_layout, never_updated
 from sb3_sap.permissibility import query_labels
 from sb3_sap.predictor.building import make_knowledge, make_predictor
 from sb3_sap.predictor.fitting import fit_until_best, with_progress
-from sb3_sap.predictor.knowledge import KnowledgeBuffer, PriorKnowledge
+from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.learned import LearnedPredictorMixin
 from sb3_sap.predictor.measuring import Familiarity
@@ -124,7 +124,7 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         batches: Iterable[Transitions] = batches_of(source, columns, images)
         if progress_bar:
             batches = with_progress(batches)
-        prior = copy.deepcopy(self.knowledge.prior) or make_knowledge(self, PriorKnowledge)
+        prior = copy.deepcopy(self.knowledge.prior) or make_knowledge(self, prior=True)
         replay, rows, counts, refused = self._new_replay(into, source), 0, Counter[bool | None](), Counter[str]()
         for batch in batches:
             whole, sound, why = fitting(batch, self.observation_space, self.action_space)
@@ -135,7 +135,8 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
             if labels is not None and into != "replay":
                 prior.add(_rows(whole.obs, sound), scaled.reshape(len(batch), -1)[sound], labels[sound])
             if labels is not None:
-                counts.update(labels[sound].tolist())
+                of_all = np.asarray(labels.all(axis=1)) if labels.ndim > 1 else labels
+                counts.update(of_all[sound].tolist())
             else:
                 counts[None] += int(sound.sum())
             if replay is not None:
@@ -261,8 +262,16 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         self, holder: Labels, batch: Transitions, sound: BoolArray, images: tuple[str, ...], into: Into | None
     ) -> BoolArray | None:
         """(n,) labels; of rows that are not sound they mean nothing. ``None``: there are none, and none are needed."""
+        parts = self.parts.names
+        shape = (len(batch), len(parts)) if parts else (len(batch),)
         if batch.labels is not None:
-            return batch.labels
+            given = batch.labels[:, None] if len(parts) == 1 and batch.labels.ndim == 1 else batch.labels
+            if given.shape != shape:
+                raise ValueError(
+                    f"The `labels` of the transitions have shape {batch.labels.shape}, but must have {shape}, "
+                    f"one for each {'part of the action' if parts else 'transition'}."
+                )
+            return given
         if holder.ap_function is None:
             if into == "replay" and not holder.shaping.penalises:
                 return None
@@ -270,10 +279,11 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                 "The transitions have no labels, and this model takes its own from `info`: pass `ap_function=` to the "
                 "algorithm, or give `labels` with the transitions."
             )
-        labels = np.zeros(len(batch), dtype=bool)
+        labels = np.zeros(shape, dtype=bool)
         if sound.any():
             before, after = (environment_layout(_rows(side, sound), images) for side in (batch.obs, batch.next_obs))
-            labels[sound] = query_labels(holder.ap_function, "ap_function", before, batch.actions[sound], after)
+            actions = batch.actions[sound]
+            labels[sound] = query_labels(holder.ap_function, "ap_function", before, actions, after, parts=parts)
         return labels
 
     def _scaled(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

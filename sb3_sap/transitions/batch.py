@@ -82,13 +82,17 @@ def transitions_of(arrays: Mapping[str, Any]) -> Transitions:
             if array.ndim == 0 or len(array) != n:
                 raise ValueError(f"`{name}` has the shape {array.shape}, but there are {n} actions: one row for each.")
     for name in ("rewards", "dones", "truncated", "labels"):
-        if name in given and given[name].size != n:
+        of_parts = name == "labels" and name in given and given[name].ndim == 2  # one for each part of the action
+        if name in given and given[name].size != n and not of_parts:
             raise ValueError(
                 f"`{name}` has the shape {given[name].shape}, but must have one value for each of {n} rows."
             )
     for name in ("dones", "truncated", "labels"):
         if name in given:
-            given[name] = as_bool(name, given[name])
+            shape = given[name].shape
+            given[name] = as_bool(name, given[name].ravel())
+            if name == "labels" and len(shape) == 2 and shape[1] > 1:
+                given[name] = given[name].reshape(shape)
     if "truncated" in given:  # what was cut off has ended
         given["dones"] = given["truncated"] | given.get("dones", np.zeros(n, dtype=bool))
     if "rewards" in given:

@@ -125,7 +125,7 @@ def test_observation_that_a_finite_space_does_not_have_is_refused():
     assert refused["observation that the space does not have"] == 2
 
 
-@pytest.mark.parametrize("name", ["rewards", "labels"])
+@pytest.mark.parametrize("name", ["rewards", "dones"])
 def test_one_value_for_each_row(name):
     with pytest.raises(ValueError, match="one value for each of 4 rows"):
         transitions_of(arrays(**{name: np.zeros((4, 2))}))

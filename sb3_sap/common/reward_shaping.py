@@ -90,6 +90,11 @@ class RewardShaping:
             return float(self.penalty)
         return scale * float(self.penalty.removeprefix("auto").removeprefix("_") or 1)
 
+    def of_labels(self, labels: BoolArray, scale: float = 1.0) -> FloatArray:
+        """(n,) minus c for each mistake among (n,) labels, or among (n, k) labels of k parts of the action."""
+        mistakes = ~labels
+        return -self.penalty_at(scale) * (mistakes.sum(axis=1) if mistakes.ndim > 1 else mistakes)
+
     def difference(
         self,
         labels: BoolArray | None,
@@ -109,7 +114,7 @@ class RewardShaping:
         """
         added = np.zeros(len(terminal))
         if labels is not None:
-            added -= self.penalty_at(scale) * ~labels
+            added += self.of_labels(labels, scale)
         if self.potential is not None:
             later, now = (query_potential(self.potential, o, len(terminal)) for o in (next_obs, obs))
             added += self.gamma * np.where(terminal, 0.0, later) - now

@@ -77,6 +77,7 @@ def late_labels(
         assert holder.ap_function is not None
         windows = stack_observations([stack_observations(one.later) for one in due])
         before, after = (environment_layout(o, holder.images) for o in (first, windows))
-        labels = query_labels(holder.ap_function, "ap_function", before, unscaled(action_space, actions), after)
+        argument = f"ap_function, horizon={pending.horizon}"
+        labels = query_labels(holder.ap_function, argument, before, unscaled(action_space, actions), after)
     holder.knowledge.add(first, actions.reshape(len(due), -1), labels)
     return LateLabels(envs, np.array([one.age for one in due]), labels)

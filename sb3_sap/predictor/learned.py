@@ -30,7 +30,7 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
     Where K is held, and when E is fitted, is for subclasses to say.
 
     :param ap_function: f(s, a | s'), an :class:`~sb3_sap.permissibility.APFunction` or its dotted name. ``None``:
-        the labels come from ``potential`` if there is one, else from ``info["permissible"]``
+        the labels come from ``event`` or ``potential`` if there is one, else from ``info["permissible"]``
     :param event: in place of an AP function, what makes mistakes of the last ``horizon`` actions up to its own step:
         ``"terminated"``, a true termination; any other string without a dot, a key of ``info`` whose value is above 0
         there, such as ``"cost"``; or an :class:`~sb3_sap.predictor.events.Event`, a function of single transitions, or
@@ -44,8 +44,8 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         logged returns and evaluations have the reward of the environment. ``"auto"``: the root mean square of the
         rewards so far, ``"auto_0.5"``: half of it
     :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
-        to the reward that is learned from alone, and without an ``ap_function`` an action is permissible if it does
-        not lower Φ
+        to the reward that is learned from alone, and without an ``ap_function`` or an ``event`` an action is permissible
+        if it does not lower Φ
     :param knowledge_buffer_size: capacity of K
     :param validation_fraction: share of K kept for validation
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit
@@ -117,7 +117,7 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         """Sets where the holder of K takes its labels from, and what they add to the reward."""
         self._check_label_source()
         potential = None if self.potential is None else resolve(self.potential, "potential")
-        own = None if potential is None else does_not_lower(potential)
+        own = None if potential is None or self.event is not None else does_not_lower(potential)
         holder.event = None if self.event is None else event_source(self.event)
         if self.event is None and self.horizon == 1:
             holder.pending = None

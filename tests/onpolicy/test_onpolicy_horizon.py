@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from gymnasium import spaces
-from rollouts import build_on_policy
+from rollouts import assert_same_learning, build_on_policy
 from scripted import FIRST, SECOND, THIRD, envs, expected, labels_of, steps_of
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -22,7 +22,8 @@ def test_penalty_reaches_the_rewards_of_the_rollout(algorithm, scripts):
     observed = steps_of(model.rollout_buffer.observations.reshape(len(scripts), 16, 3).swapaxes(0, 1))
     added = (model.rollout_buffer.rewards - plain.rollout_buffer.rewards).reshape(-1, len(scripts))
     np.testing.assert_allclose(added, [[-4.0 * (labels.get(p) is False) for p in row] for row in observed])
-    np.testing.assert_array_equal(model.rollout_buffer.returns, model.rollout_buffer.returns)
+    returns = model.rollout_buffer.returns.reshape(len(scripts), -1).T  # with γ = 0 they are the rewards
+    np.testing.assert_allclose(returns, model.rollout_buffer.rewards.reshape(-1, len(scripts)), atol=1e-5)
 
 
 def test_labels_of_the_next_rollout_change_no_reward_of_it():
@@ -62,3 +63,23 @@ def test_joint_actions_of_on_policy_algorithms_are_labelled_late():
 def test_penalty_that_would_come_after_every_rollout_is_refused():
     with pytest.raises(ValueError, match=r"^`penalty` = 1.0 with `horizon` = 9 would come after the end of rollouts"):
         build_on_policy(A2CAP, envs(), ap_function=None, event="cost", horizon=9, n_steps=8, penalty=1.0)
+
+
+def test_horizon_of_one_is_the_model_without_the_argument_to_the_bit():
+    plain, given = (build_on_policy(PPOAP, penalty=1.0, **extra).learn(64) for extra in ({}, {"horizon": 1}))
+    assert_same_learning(plain, given)
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_pending_actions_are_saved_with_the_model(tmp_path, goes_on):
+    long = [(100, True, (17,))]
+    settings = {"ap_function": None, "event": "cost", "horizon": 4}
+    build_on_policy(PPOAP, env := envs(long), **settings).learn(16).save(tmp_path / "model")
+    loaded = PPOAP.load(tmp_path / "model", env=env, force_reset=not goes_on)
+    assert len(loaded.labelled.pending) == 3
+    loaded.learn(16, reset_num_timesteps=False)
+    found = {place: label for place, label in labels_of(loaded).items() if place[1] == 0 and place[2] > 12}
+    if goes_on:
+        assert [found[0, 0, t] for t in range(13, 20)] == [True, False, False, False, False, True, True]
+    else:
+        assert found == {}

@@ -144,6 +144,18 @@ def test_horizon_of_one_is_the_model_without_the_argument_to_the_bit():
     assert given.replay_buffer.pending is None
 
 
+def did_not_fall(obs, actions, next_obs):
+    return ~fell(obs, actions, next_obs)
+
+
+def test_event_of_one_step_equals_its_ap_function_to_the_bit():
+    settings = {"penalty": 4.0, "learning_starts": 10}
+    one = untrained(SACAP, envs(FIRST, SECOND), event=fell, **settings).learn(60)
+    other = untrained(SACAP, envs(FIRST, SECOND), ap_function=did_not_fall, **settings).learn(60)
+    assert_same_state(one, other)
+    assert one.predictor.fitted
+
+
 # ---------------------------------------------------------------- rewards
 
 
@@ -248,7 +260,7 @@ def test_loaded_model_goes_on_as_if_it_had_not_been_saved(tmp_path, source):
         model.learn(20, reset_num_timesteps=False)
     assert_same_state(whole, loaded)
     np.testing.assert_array_equal(whole.replay_buffer.added, loaded.replay_buffer.added)
-    assert len(labels_of(whole)) > 30
+    assert len(labels_of(whole)) > 25
 
 
 def test_loaded_model_in_a_new_episode_drops_what_was_pending(tmp_path):
@@ -289,6 +301,10 @@ def takes_arrays(obs, actions, next_obs):
         ({"horizon": 1.5}, "^`horizon` must be a whole number of at least 1, but is 1.5"),
         ({"ap_function": towards_centre, "event": "cost"}, "^`ap_function` and `event` were both given"),
         ({"horizon": 3}, "^`horizon` = 3 needs an `ap_function` or an `event`"),
+        (
+            {"ap_function": lambda obs, actions, next_obs: next_obs[:, 0] > obs[:, 0], "horizon": 3},
+            r"^`ap_function, horizon=3` <lambda> returned an array of shape \(1, 3\) for 1 actions",
+        ),
         ({"event": "pain"}, "^`event` = 'pain' is not in the environment's `info`, .* has 'cost'"),
         ({"event": "toy.missing"}, "^`event`: 'toy.missing' cannot be imported"),
         ({"event": takes_arrays}, r"^`event` takes_arrays returned an array of shape \(1, 2\) for 1 actions"),

@@ -44,8 +44,8 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         logged returns and evaluations have the reward of the environment. ``"auto"``: the root mean square of the
         rewards so far, ``"auto_0.5"``: half of it
     :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
-        to the reward that is learned from alone, and without an ``ap_function`` or an ``event`` an action is permissible
-        if it does not lower Φ
+        to the reward that is learned from alone, and without an ``ap_function`` or an ``event`` an action is
+        permissible if it does not lower Φ
     :param knowledge_buffer_size: capacity of K
     :param validation_fraction: share of K kept for validation
     :param dataset_size: N_E, size of the balanced D_E drawn for each fit

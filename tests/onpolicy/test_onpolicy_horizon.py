@@ -39,12 +39,13 @@ def test_agreement_is_that_of_the_labels_which_are_known():
 
 
 def test_late_penalty_is_in_units_of_normalised_rewards():
-    env = VecNormalize(envs(THIRD), norm_obs=False)
+    env = VecNormalize(envs(THIRD))
     settings = {"ap_function": None, "event": "cost", "horizon": 2}
-    plain = build_on_policy(PPOAP, VecNormalize(envs(THIRD), norm_obs=False), **settings).learn(16)
+    plain = build_on_policy(PPOAP, VecNormalize(envs(THIRD)), **settings).learn(16)
     model = build_on_policy(PPOAP, env, **settings, penalty=1.0).learn(16)
     added = (model.rollout_buffer.rewards - plain.rollout_buffer.rewards).ravel()
     assert [i for i, x in enumerate(added) if x < 0] == [1, 2, 3, 9, 10, 11]
+    assert labels_of(model) == expected([THIRD], 16, 2, "cost")
     assert added.min() == pytest.approx(added[1], rel=0.5)
 
 

@@ -303,7 +303,7 @@ def takes_arrays(obs, actions, next_obs):
         ({"horizon": 3}, "^`horizon` = 3 needs an `ap_function` or an `event`"),
         (
             {"ap_function": lambda obs, actions, next_obs: next_obs[:, 0] > obs[:, 0], "horizon": 3},
-            r"^`ap_function, horizon=3` <lambda> returned an array of shape \(1, 3\) for 1 actions",
+            r"^`ap_function, horizon=3` <lambda> returned an array of shape \(3, 3\) for 3 actions",
         ),
         ({"event": "pain"}, "^`event` = 'pain' is not in the environment's `info`, .* has 'cost'"),
         ({"event": "toy.missing"}, "^`event`: 'toy.missing' cannot be imported"),

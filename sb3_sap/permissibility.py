@@ -20,7 +20,9 @@ class APFunction(Protocol):
 
     :param obs: s, raw (never normalised) observations, (n, *obs_shape)
     :param actions: a, in the units of the environment's action space, (n, *action_shape)
-    :param next_obs: s', the true next observations (never those after an automatic reset), (n, *obs_shape)
+    :param next_obs: s', the true next observations (never those after an automatic reset), (n, *obs_shape); for a model
+        with a ``horizon`` h above 1 the h observations that follow, (n, h, *obs_shape), where an episode that ended,
+        terminated or truncated, repeats its last one
     :return: (n,) bool, True where the action was permissible; with ``action_parts`` (n, k), one label for each of k
         parts
     """
@@ -125,12 +127,13 @@ def query_labels(
             f"{batches} of n = {n} rows; here the actions have shape {actions.shape}."
         ) from error
     if labels.dtype != np.bool_:
+        true = "True where it happened" if argument == "event" else "True where permissible"
         what = "NaN" if labels.dtype.kind == "f" and np.isnan(labels).any() else f"values of type {labels.dtype}"
-        raise TypeError(f"`{argument}` {name} returned {what}, but must return bool: True where permissible.")
+        raise TypeError(f"`{argument}` {name} returned {what}, but must return bool: {true}.")
     shape = (n, len(parts)) if parts else (n,)
     if labels.shape != shape:
         each = f" and each of the `action_parts` {', '.join(parts)}" if parts else ""
-        several = labels.ndim == 2 and argument == "ap_function" and not parts
+        several = labels.ndim == 2 and argument.startswith("ap_function") and not parts
         hint = ". Labels of parts of the action need `action_parts`" if several else ""
         raise ValueError(
             f"`{argument}` {name} returned an array of shape {labels.shape} for {n} actions, but must return "

@@ -27,7 +27,7 @@ from sb3_sap.common.files import atomic_path
 #: s between two snapshots.
 INTERVAL = 300.0
 #: Attributes of a replay buffer that belong to the model or to its environment.
-OF_THE_MODEL = ("env", "ap_function", "shaping", "observation_space", "action_space", "device")
+OF_THE_MODEL = ("env", "ap_function", "event", "shaping", "observation_space", "action_space", "device")
 
 
 class SnapshotCallback(BaseCallback):

@@ -37,7 +37,15 @@ ANY_TASK = ("penalty", "loss")
 GUIDANCE = (
     set(inspect.signature(ActionPermissibilityMixin).parameters) - set(inspect.signature(OffPolicyAlgorithm).parameters)
     | {"predictor_epochs"}
-) - {"ap_function", "potential", "constraint", "permissible_actions", "actor_learning_rate"}
+) - {
+    "ap_function",
+    "event",
+    "horizon",
+    "potential",
+    "constraint",
+    "permissible_actions",
+    "actor_learning_rate",
+}
 
 
 def guided_algorithms(env_id: str) -> list[str]:

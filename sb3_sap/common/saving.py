@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_sap.common.functions import can_be_pickled
 
 #: Arguments of the constructor that hold user functions.
-FUNCTIONS = ("ap_function", "constraint", "guide_policy", "permissible_actions", "potential")
+FUNCTIONS = ("ap_function", "constraint", "event", "guide_policy", "permissible_actions", "potential")
 #: SB3's settings that `load` cannot change, because the file holds a network or an optimizer's state built with them.
 HELD = ("ent_coef", "use_sde")
 

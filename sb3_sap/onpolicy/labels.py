@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_sap.common.arrays import BoolArray, FloatArray, copy_observation
 from sb3_sap.predictor.labelling import set_row, take_in
+from sb3_sap.predictor.late import LateLabels
 
 
 class LabelCallback(BaseCallback):
@@ -27,11 +29,26 @@ class LabelCallback(BaseCallback):
         super().__init__()
         #: (n_envs,) labels of each step of the rollout; empty if there are none.
         self.labels: list[BoolArray] = []
+        #: (row, environment, label) of each action of the rollout whose label became known later than its step.
+        self.late_labels: list[tuple[Any, Any, BoolArray]] = []
+        #: The late labels of the last step, and what they add to the rewards.
+        self.late: tuple[LateLabels, FloatArray] | None = None
         #: What the last step adds to the rewards that are learned from, (n_envs,); ``None``: nothing.
         self.added: FloatArray | None = None
 
     def _on_rollout_start(self) -> None:
-        self.labels = []
+        self.labels, self.late_labels = [], []
+
+    def of_rollout(self, values: FloatArray) -> tuple[BoolArray, FloatArray] | None:
+        """The labels of the rollout with the values of their steps.
+
+        :param values: (steps, n_envs)
+        :return: two arrays of one shape; ``None``: there are no labels
+        """
+        if self.late_labels:
+            rows, envs, labels = (np.concatenate(column) for column in zip(*self.late_labels, strict=True))
+            return labels, values[rows, envs]
+        return (np.stack(self.labels), values) if len(self.labels) == len(values) else None
 
     def _on_step(self) -> bool:
         model, normalize = self.model, self.model.get_vec_normalize_env()
@@ -50,7 +67,7 @@ class LabelCallback(BaseCallback):
         actions = self.locals["clipped_actions"]
         if isinstance(model.action_space, spaces.Box):
             actions = model.policy.scale_action(actions)
-        labels, added = take_in(
+        labels, added, late = take_in(
             model.labelled, model.action_space, obs, next_obs, actions, rewards, self.locals["dones"], infos
         )
         if labels is not None:
@@ -58,7 +75,23 @@ class LabelCallback(BaseCallback):
         if added is not None and normalize is not None and normalize.norm_reward:
             added = normalize.normalize_reward(rewards + added) - normalize.normalize_reward(rewards)
         self.added = added
+        self.late = None if late is None else (late, self._penalties(late))
         return True
+
+    def _penalties(self, late: LateLabels) -> FloatArray:
+        """Notes late labels of this rollout, and returns what they add to its rewards."""
+        model, normalize = self.model, self.model.get_vec_normalize_env()
+        rows = self.locals["rollout_buffer"].pos - late.ages
+        inside = rows >= 0
+        self.late_labels.append((rows[inside], late.envs[inside], late.of_all[inside]))
+        penalties: FloatArray = model.labelled.shaping.of_labels(late.labels, float(model.labelled.reward_scale))
+        return penalties if normalize is None else normalize.normalize_reward(penalties)
+
+    def add_late(self, rollout_buffer: RolloutBuffer) -> None:
+        """Changes the rewards of earlier steps of the rollout; those of an earlier rollout have been learned from."""
+        if self.late is not None:
+            late, penalties = self.late
+            late.penalise([rollout_buffer.rewards], rollout_buffer.pos - 1, penalties, ring=False)
 
 
 @contextmanager
@@ -72,6 +105,7 @@ def shaped_rewards(rollout_buffer: RolloutBuffer, labels: LabelCallback) -> Iter
 
     def shaped_add(obs: Any, action: Any, reward: Any, *args: Any, **kwargs: Any) -> None:
         add(obs, action, reward if labels.added is None else reward + labels.added, *args, **kwargs)
+        labels.add_late(rollout_buffer)
 
     rollout_buffer.add = shaped_add  # type: ignore[method-assign]
     try:

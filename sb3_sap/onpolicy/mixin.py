@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_sap.common.arrays import BoolArray
 from sb3_sap.common.errors import check_at_least, is_number
 from sb3_sap.common.extractors import with_extractor
+from sb3_sap.common.reward_shaping import RewardShaping
 from sb3_sap.common.saving import SavingMixin
 from sb3_sap.common.schedules import as_schedule
 from sb3_sap.common.signatures import merged_signature
@@ -160,7 +161,12 @@ class OnPolicyPermissibilityMixin(PriorKnowledgeMixin, SavingMixin, OnPolicyAlgo
                 f"`alpha` is 1 (E guides once it is accurate) or 0 (it never does), because the update must know the "
                 f"masks, but is {self.alpha!r}."
             )
-        check_at_least(self, n_candidates=1)
+        check_at_least(self, n_candidates=1, horizon=1)
+        if self.horizon > self.n_steps and RewardShaping(self.penalty).penalises:
+            raise ValueError(
+                f"`penalty` = {self.penalty!r} with `horizon` = {self.horizon} would come after the end of rollouts of "
+                f"`n_steps` = {self.n_steps}: raise `n_steps`, or leave the penalty out."
+            )
         if self.permissible_actions is not None and isinstance(self.action_space, spaces.Box):
             raise ValueError(
                 f"`permissible_actions` of an on-policy algorithm masks finite actions, but the action space is "
@@ -247,8 +253,9 @@ class OnPolicyPermissibilityMixin(PriorKnowledgeMixin, SavingMixin, OnPolicyAlgo
     def train(self) -> None:
         """Fits of E to the new labels; then SB3's ``train``, with the masks of the rollout and the loss on E."""
         self._refit()
-        if len(self._label_callback.labels) == len(self.rollout_buffer.advantages):  # every step has labels
-            self.agreement.update(np.stack(self._label_callback.labels), self.rollout_buffer.advantages)
+        labelled = self._label_callback.of_rollout(self.rollout_buffer.advantages)
+        if labelled is not None:
+            self.agreement.update(*labelled)
         coef = FloatSchedule(self.permissibility_coef)(self._current_progress_remaining) * float(self.agreement)
         policy = cast(GuidedPolicyMixin, self.policy)
         if coef > 0 and self._judges:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -17,8 +17,10 @@ from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
 from sb3_sap.common.spaces import unscaled
 from sb3_sap.common.vec_envs import environment_layout
 from sb3_sap.permissibility import APFunction, query_labels
+from sb3_sap.predictor.events import Event
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import take_in
+from sb3_sap.predictor.pending import Pending
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -28,6 +30,10 @@ class KnowledgeMixin(ReplayBuffer):
     :param ap_function: labels the transitions; without it the label is taken from ``info["permissible"]``
     """
 
+    #: What makes mistakes of the actions before it, in place of an AP function.
+    event: Event | str | None = None
+    #: The actions that wait for their labels, saved with the buffer; None: each is labelled at its own step.
+    pending: Pending | None = None
     #: The images that the AP function gets channels last (:func:`~sb3_sap.common.vec_envs.channels_last`).
     images: tuple[str, ...] = ()
     #: What is added to the rewards that R stores; those of the environment, which are logged, remain as they are.
@@ -66,7 +72,7 @@ class KnowledgeMixin(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         # SB3 passes raw observations here, and the true last one of an episode.
-        _, added = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
+        _, added, late = take_in(self, self.action_space, obs, next_obs, action, reward, done, infos)
         if added is not None:
             reward = reward + added
             if self.added is None:
@@ -74,6 +80,9 @@ class KnowledgeMixin(ReplayBuffer):
         if self.added is not None:
             self.added[self.pos] = 0.0 if added is None else added
         super().add(obs, next_obs, action, reward, done, infos)
+        if late is not None and self.shaping.penalises:
+            penalties = self.shaping.of_labels(late.labels, float(self.reward_scale))
+            late.penalise([self.rewards, cast(FloatArray, self.added)], self.pos - 1, penalties, ring=True)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
         """SB3's ``sample``; of the batch, ``prior_share`` comes from `prior`, if it holds anything."""
@@ -93,7 +102,7 @@ class KnowledgeMixin(ReplayBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         # The user's functions belong to the model; the file holds only data.
-        return {**super().__getstate__(), "ap_function": None, "shaping": RewardShaping()}  # type: ignore[dict-item]
+        return {**super().__getstate__(), "ap_function": None, "event": None, "shaping": RewardShaping()}  # type: ignore[dict-item]
 
 
 class PermissibilityReplayBuffer(KnowledgeMixin, ReplayBuffer):
@@ -129,7 +138,7 @@ class PermissibilityHerReplayBuffer(KnowledgeMixin, HerReplayBuffer):
         )
         before, after = (environment_layout(side, self.images) for side in (obs, next_obs))
         labels = None
-        if self.ap_function is not None:
+        if self.ap_function is not None and self.pending is None:
             actions = unscaled(self.action_space, raw.actions.cpu().numpy())
             parts = self.knowledge.part_names
             labels = query_labels(self.ap_function, "ap_function", before, actions, after, parts=parts)

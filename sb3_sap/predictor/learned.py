@@ -17,10 +17,12 @@ from sb3_sap.common.reward_shaping import Potential, RewardShaping
 from sb3_sap.common.watching import WatchedEnvironmentMixin
 from sb3_sap.permissibility import APFunction, does_not_lower
 from sb3_sap.predictor.building import make_predictor
+from sb3_sap.predictor.events import Event, event_source
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.network import SUFFICIENT_ACCURACY, PermissibilityPredictor
 from sb3_sap.predictor.optimizer_state import check_same_optimizer, settings_of
+from sb3_sap.predictor.pending import Pending
 
 
 class LearnedPredictorMixin(WatchedEnvironmentMixin):
@@ -29,13 +31,22 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
     Where K is held, and when E is fitted, is for subclasses to say.
 
     :param ap_function: f(s, a | s'), an :class:`~sb3_sap.permissibility.APFunction` or its dotted name. ``None``:
-        the labels come from ``potential`` if there is one, else from ``info["permissible"]``
+        the labels come from ``event`` or ``potential`` if there is one, else from ``info["permissible"]``
+    :param event: in place of an AP function, what makes mistakes of the last ``horizon`` actions up to its own step:
+        ``"terminated"``, a true termination; any other string without a dot, a key of ``info`` whose value is above 0
+        there, such as ``"cost"``; or an :class:`~sb3_sap.predictor.events.Event`, a function of single transitions, or
+        its dotted name. An action is permissible once ``horizon`` steps, its own included, have passed without an
+        event, or its episode has terminated without one. What an episode that is cut off leaves open is not labelled
+    :param horizon: h, the number of steps, its own included, over which an action is judged. With more than 1 the AP
+        function gets a window, f(s_t, a_t | s_{t+1}, ..., s_{t+h}): its ``next_obs`` has shape (n, h, *obs_shape),
+        where an episode that ended repeats its last observation, whether it terminated or was truncated. Labels and
+        penalties come with the last of these steps, penalties as long as the transition is still stored
     :param penalty: c, subtracted from the reward of a non-permissible action in the reward that is learned from alone:
         logged returns and evaluations have the reward of the environment. ``"auto"``: the root mean square of the
         rewards so far, ``"auto_0.5"``: half of it
     :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
-        to the reward that is learned from alone, and without an ``ap_function`` an action is permissible if it does
-        not lower Φ
+        to the reward that is learned from alone, and without an ``ap_function`` or an ``event`` an action is
+        permissible if it does not lower Φ
     :param action_parts: names of parts of the action with their dimensions, such as ``{"steering": [0], "pedal":
         [1]}``, which have labels of their own: the AP function then returns (n, k), ``info["permissible"]`` holds (k,)
         bool, and a part that E rejects is replaced alone. A penalty is subtracted once for each part. ``None``: the
@@ -54,6 +65,8 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         self,
         *args: Any,
         ap_function: APFunction | str | None = None,
+        event: Event | str | None = None,
+        horizon: int = 1,
         penalty: float | str = 0.0,
         potential: Potential | str | None = None,
         action_parts: Mapping[str, Sequence[int]] | None = None,
@@ -66,6 +79,8 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         **kwargs: Any,
     ):
         self.ap_function = ap_function
+        self.event = event
+        self.horizon = horizon
         self.penalty = penalty
         self.potential = potential
         self.action_parts = action_parts
@@ -86,10 +101,11 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
 
     def _check_knowledge_settings(self) -> None:
         check_at_least(self, knowledge_buffer_size=4, min_per_class=1, dataset_size=2, validation_size=2)
-        if self.parts and self.ap_function is None and self.potential is not None:
-            raise ValueError(
-                "`potential` labels the action as a whole: with `action_parts` give an `ap_function` for each part."
-            )
+        for name in ("event", "potential"):
+            if self.parts and self.ap_function is None and getattr(self, name) is not None:
+                raise ValueError(
+                    f"`{name}` labels the action as a whole: with `action_parts` give an `ap_function` for each part."
+                )
 
     @property
     def parts(self) -> ActionParts:
@@ -110,15 +126,38 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         """Whether there is a K, which a model may lack while it is built or loaded."""
         raise NotImplementedError
 
+    def _label_holder(self) -> Labels:
+        """What knows where labels come from."""
+        raise NotImplementedError
+
     def _set_label_source(self, holder: Labels) -> None:
         """Sets where the holder of K takes its labels from, and what they add to the reward."""
+        self._check_label_source()
         potential = None if self.potential is None else resolve(self.potential, "potential")
-        own = None if potential is None else does_not_lower(potential)
+        own = None if potential is None or self.event is not None else does_not_lower(potential)
+        holder.event = None if self.event is None else event_source(self.event)
+        if self.event is None and self.horizon == 1:
+            holder.pending = None
+        elif holder.pending is None or holder.pending.horizon != self.horizon:
+            holder.pending = Pending(self.horizon)
         holder.ap_function = own if self.ap_function is None else resolve(self.ap_function, "ap_function")
         holder.shaping = RewardShaping(self.penalty, potential, self.gamma)  # type: ignore[attr-defined]
         holder.images = self.images
         # With `permissible_actions` a model may do without labels of executed actions, but a penalty needs them.
         holder.needs_labels = holder.shaping.penalises or getattr(self, "permissible_actions", None) is None
+
+    def _check_label_source(self) -> None:
+        check_at_least(self, horizon=1)
+        if self.ap_function is not None and self.event is not None:
+            raise ValueError(
+                "`ap_function` and `event` were both given, but labels come from one of them: leave one out, or let "
+                "the AP function say what the event says."
+            )
+        if self.horizon > 1 and self.ap_function is None and self.event is None:
+            raise ValueError(
+                f"`horizon` = {self.horizon} needs an `ap_function` or an `event`, because the labels of `potential` "
+                'and of `info["permissible"]` are of single steps: give one of them, or leave `horizon` out.'
+            )
 
     def _setup_learn(
         self,
@@ -130,7 +169,12 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps:
             self._steps_of_earlier_learns += self.num_timesteps
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        last_obs: Any = self._last_obs
+        found = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        pending = self._label_holder().pending
+        if pending is not None and self._last_obs is not last_obs:  # the environments were reset
+            pending.clear()
+        return found
 
     @property
     def lifetime_steps(self) -> int:

@@ -87,6 +87,12 @@ class LearnedPermissibilityMixin(PriorKnowledgeMixin, SettingsMixin):
             buffer.reward_scale = holder.reward_scale
             if isinstance(buffer, HerReplayBuffer) and buffer.env is None and self.env is not None:
                 buffer.set_env(self.env)
+        if holder.shaping.penalises and holder.pending is not None and isinstance(holder, HerReplayBuffer):
+            raise ValueError(
+                f"`penalty` = {self.penalty!r} with `horizon` above 1 or an `event` cannot be combined with "
+                f"{type(holder).__name__}, because a hindsight goal would need labels of its own: leave the penalty "
+                "out, or use an `ap_function` of single steps."
+            )
         if holder.shaping.penalises and holder.ap_function is None and isinstance(holder, HerReplayBuffer):
             raise ValueError(
                 f"`penalty` = {self.penalty!r} needs an `ap_function` beside {type(holder).__name__}, for a hindsight "

@@ -246,10 +246,6 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         super()._set_label_source(holder)
         holder.knowledge.prior_share = self.prior_share
 
-    def _label_holder(self) -> Labels:
-        """What knows where labels come from."""
-        raise NotImplementedError
-
     def _new_replay(self, into: Into | None, source: Any) -> Any:
         """Where transitions for the agent's updates go; None: nowhere."""
         if into in ("replay", "both"):
@@ -272,9 +268,14 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                     f"one for each {'part of the action' if parts else 'transition'}."
                 )
             return given
-        if holder.ap_function is None:
+        if holder.ap_function is None or holder.pending is not None:
             if into == "replay" and not holder.shaping.penalises:
                 return None
+            if holder.pending is not None:
+                raise ValueError(
+                    "The transitions have no labels, and this model's `horizon` or `event` labels its own steps alone: "
+                    "give `labels` with the transitions."
+                )
             raise ValueError(
                 "The transitions have no labels, and this model takes its own from `info`: pass `ap_function=` to the "
                 "algorithm, or give `labels` with the transitions."

@@ -201,6 +201,22 @@ def test_labels_of_parts_need_the_parts():
         DDPGAP("MlpPolicy", Plane(), potential=lambda obs: -np.abs(obs).sum(axis=1), action_parts=PARTS)
 
 
+def stays_near(obs, actions, next_obs):
+    return (np.abs(next_obs) <= np.abs(obs)[:, None] + 0.3).all(axis=1)  # (n, 3, 2) -> (n, 2)
+
+
+@pytest.mark.parametrize("algorithm", [DDPGAP, PPOAP])
+def test_labels_of_parts_may_come_late(algorithm):
+    more = {"n_steps": 30, **SMALL} if algorithm is PPOAP else OFF_POLICY
+    model = algorithm("MlpPolicy", Plane(), ap_function=stays_near, action_parts=PARTS, horizon=3, penalty=1.0, **more)
+    model.learn(60)
+    assert sum(model.knowledge.seen) == 60
+    assert all(sum(store.seen) == 60 for store in model.knowledge.each)
+    assert [store.seen for store in model.knowledge.each] != [model.knowledge.seen] * 2
+    with pytest.raises(ValueError, match="`event` labels the action as a whole"):
+        algorithm("MlpPolicy", Plane(), event="terminated", action_parts=PARTS, horizon=3)
+
+
 def test_saved_model_goes_on_alike(tmp_path):
     model = of_the_info(actor_permissibility_coef=1.0).learn(60)
     model.save(tmp_path / "model")

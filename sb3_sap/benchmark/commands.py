@@ -33,6 +33,7 @@ REPORTS = {
     "auxiliary": (["auxiliary"], "summary of how often the auxiliary actor loss is applied"),
     "robustness": (["robustness"], "summary at 80 km/h and from random starts, for which nothing was tuned"),
     "ways": (["ways"], "ways of using the label: none, as a reward penalty, a loss beside it, and guidance"),
+    "failing": (["failing"], "the same for the penalty alone, on many seeds: how many runs fail"),
     "on_policy": (["on_policy"], "the same for PPO"),
     "starts": (["starts"], "the same for runs that begin with knowledge of elsewhere"),
     "wrong_labels": (["wrong_labels"], "the same for labels that are wrong"),
@@ -40,7 +41,7 @@ REPORTS = {
 #: Reports that are summaries of other configurations.
 SUMMARIES = ("summary", "ablations", "details", "readings", "auxiliary", "robustness")
 #: Reports that compare ways of using the label.
-WAYS = ("ways", "on_policy", "wrong_labels", "starts")
+WAYS = ("ways", "failing", "on_policy", "wrong_labels", "starts")
 #: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
 LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.

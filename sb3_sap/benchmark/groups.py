@@ -96,6 +96,8 @@ GROUPS: dict[str, list[str]] = {
             "fast",
         )
     ],
+    # The recommended use of the label, on more seeds: how many runs fail?
+    "failing": [f"{algo}:base+penalty" for algo in ("ddpg_ap", "td3_ap", "sac_ap")],
     # The same for PPO.
     "on_policy": [
         f"ppo_ap:{presets}"

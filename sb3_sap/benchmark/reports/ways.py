@@ -57,7 +57,8 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     shares = EARLY_SHARES if kind == "starts" else SHARES
     rows = [_row(results, scores, name, reference, shares) for name in results.names]
     improvements = improvement(results, scores, kind)
-    write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
+    if not improvements.empty:
+        write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
         # The presets of `zoo_configs`: PPO has a smaller penalty, and its loss has none beside it.
@@ -69,12 +70,14 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     )
     parts = [f"![Scores over training steps]({kind}.svg)\n", markdown(pd.DataFrame(rows)), note]
     of = {"wrong_labels": "of the base algorithm", "starts": "from scratch with the loss"}.get(kind, "with the penalty")
-    parts += [f"## Probability that a run ends better than one {of}\n"]
-    intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
-    parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
+    if not improvements.empty:
+        parts += [f"## Probability that a run ends better than one {of}\n"]
+        intervals = [f"{p:.2f} [{low:.2f}, {high:.2f}]" for p, low, high in improvements.iloc[:, 2:].to_numpy()]
+        parts += [markdown(improvements.iloc[:, :2].assign(**{"probability of improvement": intervals}))]
     title = {
         "wrong_labels": "Ways of using the label, with wrong labels",
         "starts": "What a run begins with",
+        "failing": "How many runs with the penalty fail",
     }.get(kind, "Ways of using the label")
     title = f"{title} ({results.simulator}, {results.steps:,} steps)"
     write_page(folder / f"{kind}.md", title, parts, results, command)

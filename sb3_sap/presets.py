@@ -58,16 +58,16 @@ def preset_names(algo: str | type) -> list[str]:
 def preset(name: str, algo: str | type | None = None, steps: int | None = None) -> dict[str, Any]:
     """Constructor arguments: ``TQCAP("MlpPolicy", env, **preset("fast", TQCAP))``.
 
-    :param name: ``"paper"``, the values of section 5.1; ``"fast"``, the settings that learn lane keeping fastest;
+    :param name: ``"paper"``, the values of section 5.1; ``"paper_adam"``, the same with E fitted by Adam; ``"fast"``, the settings that learn lane keeping fastest;
         ``"tuned"``, the best settings of a baseline on lane keeping; or ``"default"``, those of the constructor
     :param algo: the algorithm, a class of this package, one derived from it, or its RL Zoo name. ``None``: DDPG-AP,
-        for the paper's preset only
+        for the paper's presets only
     :param steps: planned timesteps of the training: a short one may have settings of its own. ``None``: a long one
     :raise TypeError: if ``steps`` is not a number
     :raise ValueError: if the preset or the algorithm is unknown, or the algorithm is missing
     """
     if algo is None:
-        if name != "paper":
+        if name not in ("paper", "paper_adam"):
             _check("name", name, list(dict.fromkeys(known for each in algorithms() for known in preset_names(each))))
             raise ValueError(
                 f"The preset {name!r} differs from algorithm to algorithm: name yours, as in preset({name!r}, TQCAP) "

@@ -59,6 +59,14 @@ def test_t_k_follows_the_length_of_the_run():
     assert preset("paper", steps=3_000)["t_k"] == 150
 
 
+def test_other_reading_differs_in_how_e_is_fitted_alone():
+    for steps in (3_000, 15_000):
+        literal, adam = preset("paper", steps=steps), preset("paper_adam", steps=steps)
+        fitted = literal.pop("predictor_kwargs"), adam.pop("predictor_kwargs")
+        assert literal == adam
+        assert fitted[1] == {**fitted[0], "optimizer_class": "Adam", "learning_rate": 0.001, "weight_decay": 0}
+
+
 def test_paper_preset_is_applied_to_a_model():
     env = gym.make("sap/LaneKeeping-v0")
     model = DDPGAP("MlpPolicy", env, **preset("paper"))
@@ -97,7 +105,7 @@ def test_every_algorithm_has_an_installed_configuration():
     [
         (("papper",), "did you mean 'paper'"),
         (("paper", "ddpg_pa"), "did you mean 'ddpg_ap'"),
-        (("x", "ddpg_ap"), "one of 'paper', 'default'"),
+        (("x", "ddpg_ap"), "one of 'paper', 'paper_adam', 'default'"),
         (("fats",), "did you mean 'fast'"),
         (("fast",), r"preset\('fast', TQCAP\) or preset\('fast', 'tqc_ap'\)"),
         (("default",), "differs from algorithm to algorithm"),

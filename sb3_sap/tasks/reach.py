@@ -13,6 +13,10 @@ Observation = Mapping[str, np.ndarray[Any, Any]]
 
 #: Distance from the goal within which the environment counts success, m.
 NEAR = 0.05
+#: The same along one axis: within it on all three, the hand is within `NEAR`.
+NEAR_AXIS = NEAR / 3**0.5
+#: The parts of the action of `fetch_reach_axes`.
+AXES = {"x": [0], "y": [1], "z": [2]}
 
 
 def fetch_reach(obs: Observation, actions: np.ndarray[Any, Any], next_obs: Observation) -> BoolArray:
@@ -40,3 +44,18 @@ def distance(obs: Observation) -> FloatArray:
     """From the hand to its goal; (n,) m."""
     gap: FloatArray = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"], axis=1)
     return gap
+
+
+def fetch_reach_axes(obs: Observation, actions: np.ndarray[Any, Any], next_obs: Observation) -> BoolArray:
+    """``FetchReach-v4``, a label for each axis: False where the hand came no nearer to its goal along that axis, while
+    it is more than `NEAR_AXIS` from it there.
+
+    *Argument.* That of :func:`fetch_reach`, for each of three movements that do not depend on each other.
+
+    :param obs: as for :func:`fetch_reach`; so are ``actions`` and ``next_obs``
+    :return: (n, 3) bool, for `AXES`
+    """
+    del actions
+    gap, next_gap = (np.abs(o["achieved_goal"] - o["desired_goal"]) for o in (obs, next_obs))
+    permissible: BoolArray = (next_gap < gap) | (next_gap < NEAR_AXIS)
+    return permissible

@@ -253,4 +253,6 @@ def test_hand_must_come_nearer_to_its_goal():
     before = {"desired_goal": goal, "achieved_goal": rows([0.2, 0, 0], [0.2, 0, 0], [0.2, 0, 0], [0, 0.01, 0])}
     after = {"desired_goal": goal, "achieved_goal": rows([0.1, 0, 0], [0.2, 0, 0], [0, 0.3, 0], [0, 0.04, 0])}
     assert tasks.fetch_reach(before, np.zeros((4, 4)), after).tolist() == [True, False, False, True]
+    axes = tasks.fetch_reach_axes(before, np.zeros((4, 4)), after)
+    assert axes.tolist() == [[True] * 3, [False, True, True], [True, False, True], [True, False, True]]
     assert tasks.nearness(before).tolist() == pytest.approx([-4, -4, -4, -0.2])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_sap.algorithms import ALGORITHMS, base_of
+from sb3_sap.algorithms import GUIDED_ALGORITHMS, base_of
 from sb3_sap.benchmark.learners import CLASSES
 from sb3_sap.comparison.ways import Way
 from sb3_sap.comparison.worker import Job
@@ -29,7 +29,7 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
                 f"{noise['sigma']} * np.ones(env.action_space.shape))"
             )
     else:
-        cls = ALGORITHMS[job.algo].__name__
+        cls = GUIDED_ALGORITHMS[job.algo].__name__
         names = [cls]
         if ap_function is not None:
             arguments.append(f"ap_function={_imported(ap_function, imports)}")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 import torch as th
@@ -171,6 +171,29 @@ class PermissibilityPredictor(BaseModel):
         actions = _encoded(self.action_space, actions)
         # A float64 action space brings float64 actions.
         return self.head(th.cat([features, actions.to(features.dtype)], dim=1)).squeeze(1)  # type: ignore[no-any-return]
+
+    def logits_of_each(self, parts: Sequence[th.Tensor], actions: th.Tensor) -> list[th.Tensor]:
+        """(n, k) logits of k actions in the n states of each part.
+
+        For many actions far faster than :meth:`logits`: of the first layer, whose inputs are mostly those of a one-hot
+        action, features and actions have their shares once. The logits differ by rounding alone.
+
+        :param parts: (n, features_dim) features
+        :param actions: (k, action_dim), scaled
+        """
+        first, *others = cast(Iterable[Any], self.head)
+        of_features, of_actions = first.weight.tensor_split([parts[0].shape[1]], dim=1)
+        if isinstance(self.action_space, spaces.Discrete):
+            share = of_actions.t()[actions.flatten().long()]
+        else:
+            share = F.linear(_encoded(self.action_space, actions).to(of_actions.dtype), of_actions)
+        found = []
+        for part in parts:
+            hidden = (F.linear(part, of_features, first.bias)[:, None] + share).flatten(0, 1)
+            for layer in others:
+                hidden = layer(hidden)
+            found.append(hidden.reshape(len(part), -1))
+        return found
 
     def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of n observations and (n, action_dim) scaled actions."""

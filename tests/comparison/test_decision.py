@@ -127,7 +127,7 @@ def test_code_names_functions_of_a_notebook_without_importing_them():
         ({"seeds": 1}, "^`seeds` must be a whole number of at least 2, but is 1"),
         ({"minutes": 0}, "^`minutes` must be a number above 0, but is 0"),
         ({"steps": 0}, "^`steps` must be a whole number of at least 1, but is 0"),
-        ({"algo": "sac"}, "^`algo` = 'sac' is not a guided algorithm: did you mean 'sac_ap'"),
+        ({"algo": "sacc"}, "^`algo` = 'sacc' has no guided algorithm: did you mean 'sac_ap'"),
         ({"ap_function": "toy.missing"}, "^`ap_function`: 'toy.missing' cannot be imported"),
     ],
 )

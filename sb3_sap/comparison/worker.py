@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_sap.algorithms import GUIDED_ALGORITHMS
 from sb3_sap.benchmark.process import SINGLE_THREADED
 from sb3_sap.evaluation.environments import make_env
+from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
 #: Seed of the evaluation episodes, the same in every run.
@@ -39,6 +40,7 @@ class Job:
 
     :param env: id of an environment, or a function that makes one
     :param settings: constructor arguments
+    :param guided: whether evaluations are guided by E
     """
 
     env: str | Callable[..., gym.Env[Any, Any]]
@@ -49,6 +51,7 @@ class Job:
     steps: int
     evaluations: int
     episodes: int
+    guided: bool = False
 
     @property
     def rollout(self) -> int:
@@ -76,11 +79,11 @@ class Job:
 
 
 class Evaluations(BaseCallback):
-    """Evaluates the policy alone at equal distances, and reports each evaluation."""
+    """Evaluates the policy at equal distances, alone unless the job says otherwise, and reports each evaluation."""
 
     def __init__(self, job: Job, report: Callable[[dict[str, Any]], None]):
         super().__init__()
-        self._report, self._episodes = report, job.episodes
+        self._report, self._episodes, self._guided = report, job.episodes, job.guided
         self._due = job.evaluated_at
         self._env = DummyVecEnv([lambda: Monitor(job.make_env())])
 
@@ -99,7 +102,8 @@ class Evaluations(BaseCallback):
     def _evaluate(self, step: int) -> None:
         self._env.seed(EVALUATION_SEED)
         began = time.monotonic()
-        mean, _ = evaluate_policy(self.model, self._env, self._episodes)
+        policy: Any = GuidedPolicy(self.model) if self._guided else self.model
+        mean, _ = evaluate_policy(policy, self._env, self._episodes)
         mistakes, others = self.model.knowledge.seen  # type: ignore[attr-defined]
         row = {"step": step, "return": float(cast(float, mean)), "mistakes": mistakes / max(1, mistakes + others)}
         self._report({**row, "took": time.monotonic() - began})

@@ -15,6 +15,7 @@ import shlex
 from pathlib import Path
 
 from sb3_sap.algorithms import ALGORITHMS
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.presets import algorithms, preset_names
 
 ROOT = Path(__file__).parent.parent
@@ -55,8 +56,9 @@ def table_of_presets() -> str:
     """Which algorithm has which presets."""
     presets = list(dict.fromkeys(name for algo in algorithms() for name in preset_names(algo)))
     lines = [f"| class | name | {' | '.join(f'`{name}`' for name in presets)} |", f"|{' --- |' * (len(presets) + 2)}"]
-    for algo in sorted(algorithms(), key=lambda algo: algo not in ALGORITHMS):
-        named = f"`{ALGORITHMS[algo].__name__}`" if algo in ALGORITHMS else ""
+    classes: dict[str, type] = {**ALGORITHMS, **ON_POLICY_ALGORITHMS}
+    for algo in sorted(algorithms(), key=lambda algo: algo not in classes):
+        named = f"`{classes[algo].__name__}`" if algo in classes else ""
         marks = " | ".join("✓" if name in preset_names(algo) else "" for name in presets)
         lines.append(f"| {named} | `{algo}` | {marks} |")
     return "\n".join(lines)

@@ -8,7 +8,9 @@ from sb3_contrib import QRDQN, TQC, CrossQ
 from stable_baselines3 import DDPG as PlainDDPG
 from stable_baselines3 import DQN, SAC, TD3
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_sap.common.errors import nearest
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.constraints import ActionConstraint
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
@@ -108,11 +110,27 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
 }
 
 
+#: Every algorithm that learns permissibility, off-policy and on-policy, by its RL Zoo name.
+GUIDED_ALGORITHMS: dict[str, type[OffPolicyAlgorithm] | type[OnPolicyAlgorithm]] = {
+    **{name: cls for name, cls in ALGORITHMS.items() if issubclass(cls, LearnedPermissibilityMixin)},
+    **ON_POLICY_ALGORITHMS,
+}
+
+
 def is_guided(algo: str) -> bool:
     """Whether the algorithm of that RL Zoo name learns permissibility."""
-    return algo in ON_POLICY_ALGORITHMS or (
-        algo in ALGORITHMS and issubclass(ALGORITHMS[algo], LearnedPermissibilityMixin)
-    )
+    return algo in GUIDED_ALGORITHMS
+
+
+def guided_name(algo: str) -> str:
+    """The RL Zoo name of the guided algorithm that is meant: its own, or that of its base, such as ``"ppo"``.
+
+    :raise ValueError: if there is none
+    """
+    for name in (algo, f"{algo}_ap"):
+        if name in GUIDED_ALGORITHMS:
+            return name
+    raise ValueError(f"`algo` = {algo!r} has no guided algorithm: {nearest(algo, list(GUIDED_ALGORITHMS))}")
 
 
 def base_of(algo: str) -> str:

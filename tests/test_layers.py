@@ -131,6 +131,7 @@ def test_permissibility_needs_numpy_and_gymnasium_alone():
 def test_imports_are_found_as_they_are_written():
     assert "sb3_sap.guidance.mixin.ActionPermissibilityMixin" in imports(MODULES["sb3_sap.algorithms"])
     assert used("sb3_sap.algorithms") == {
+        "sb3_sap.common.errors",
         "sb3_sap.guidance.constrained",
         "sb3_sap.guidance.constraints",
         "sb3_sap.guidance.mixin",

@@ -77,7 +77,7 @@ def test_paper_preset_is_applied_to_a_model():
     assert model.critic.optimizer.param_groups[0]["lr"] == 0.001
 
 
-@pytest.mark.parametrize(("algo", "cls"), ALGORITHMS.items())
+@pytest.mark.parametrize(("algo", "cls"), [*ALGORITHMS.items(), *ON_POLICY_ALGORITHMS.items()])
 def test_preset_of_a_class_is_that_of_its_name(algo, cls):
     derived = type("Mine", (cls,), {})
     for name in preset_names(algo):
@@ -92,7 +92,7 @@ def test_fast_preset_differs_between_algorithms():
 
 
 def test_every_algorithm_has_an_installed_configuration():
-    assert set(ALGORITHMS) <= set(algorithms()) <= {*CLASSES, *ON_POLICY_ALGORITHMS}
+    assert {*ALGORITHMS, *ON_POLICY_ALGORITHMS} <= set(algorithms()) <= {*CLASSES, *ON_POLICY_ALGORITHMS}
     for algo in ALGORITHMS:
         assert ("paper" in preset_names(algo)) == algo.startswith("ddpg")
         steering = {"sap/LaneKeeping-v0", "sap/TorcsLaneKeeping-v0"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
-from typing import Any, cast
+from typing import Any, overload
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +19,31 @@ from sb3_sap.common.arrays import stack_observations
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.spaces import check_action_space, check_observation_space
 from sb3_sap.permissibility import APFunction
+
+
+@overload
+def check_permissibility(
+    env: gym.Env[Any, Any],
+    ap_function: APFunction | str | None = None,
+    policy: Any = None,
+    n_steps: int = 2_000,
+    seed: int = 0,
+    verbose: bool = True,
+    action_parts: None = None,
+) -> PermissibilityReport: ...
+
+
+@overload
+def check_permissibility(
+    env: gym.Env[Any, Any],
+    ap_function: APFunction | str | None = None,
+    policy: Any = None,
+    n_steps: int = 2_000,
+    seed: int = 0,
+    verbose: bool = True,
+    *,
+    action_parts: Mapping[str, Sequence[int]],
+) -> dict[str, PermissibilityReport]: ...
 
 
 def check_permissibility(
@@ -68,7 +93,7 @@ def check_permissibility(
             of_part = None if function is None else OfPart(function, names, number)
             judged = InfoOfPart(env, names, number) if function is None else env
             reports[name] = check_permissibility(judged, of_part, policy, n_steps, seed, verbose)
-        return cast(dict[str, PermissibilityReport], reports)
+        return reports
     act = None if policy is None else _action_function(policy, env.action_space)
     env.action_space.seed(seed)
     transitions = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)

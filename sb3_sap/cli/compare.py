@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from sb3_sap.algorithms import ALGORITHMS, is_guided
+from sb3_sap.algorithms import guided_name
 from sb3_sap.common.command_line import not_negative, positive
 from sb3_sap.common.yaml_text import read_yaml
 
@@ -24,9 +24,7 @@ def add_compare(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         "--ap-function", metavar="MODULE.FUNCTION", help="f(s, a | s'); without it info['permissible']"
     )
     command.add_argument("--potential", metavar="MODULE.FUNCTION", help="a potential of states, to compare shaping too")
-    command.add_argument(
-        "--algo", choices=[name for name in ALGORITHMS if is_guided(name)], help="by default SAC or DQN"
-    )
+    command.add_argument("--algo", type=_algorithm, metavar="NAME", help="such as sac_ap or ppo; by default SAC or DQN")
     command.add_argument("--minutes", type=float, default=10.0, help="how long the comparison may take, about")
     command.add_argument("--steps", type=positive, help="training steps of each run, instead of a time")
     command.add_argument("--seeds", type=positive, default=5, metavar="N", help="runs of each way")
@@ -56,6 +54,13 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.print(result.code, soft_wrap=True, markup=False)
     console.print(f"\nCurves, table and script are in {options.out}/.", soft_wrap=True, markup=False)
     return 0
+
+
+def _algorithm(name: str) -> str:
+    try:
+        return guided_name(name)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _mapping(text: str) -> dict[str, Any]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 from typing import Any
 
-from sb3_sap.algorithms import ALGORITHMS, base_of
+from sb3_sap.algorithms import GUIDED_ALGORITHMS, base_of
 from sb3_sap.benchmark.learners import CLASSES
 from sb3_sap.comparison.ways import Way
 from sb3_sap.comparison.worker import Job
@@ -22,6 +24,8 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
     if way.name == "base":
         module, _, cls = CLASSES[base_of(job.algo)].partition(":")
         imports.append(f"from {module} import {cls}")
+        known = inspect.signature(getattr(importlib.import_module(module), cls)).parameters
+        own = {name: value for name, value in own.items() if name in known}  # not those of guidance
         if (noise := way.settings.get("action_noise")) and "action_noise" not in job.settings:
             imports = ["import numpy as np", *imports, "from stable_baselines3.common.noise import NormalActionNoise"]
             arguments.append(
@@ -29,7 +33,7 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
                 f"{noise['sigma']} * np.ones(env.action_space.shape))"
             )
     else:
-        cls = ALGORITHMS[job.algo].__name__
+        cls = GUIDED_ALGORITHMS[job.algo].__name__
         names = [cls]
         if ap_function is not None:
             arguments.append(f"ap_function={_imported(ap_function, imports)}")
@@ -59,6 +63,7 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
             ")",
             f"model.learn({job.steps:_}, progress_bar=True)",
             'model.save("model")',
+            *(["# It acts with its mask: model.predict(observation, guided=True)"] if way.guided else []),
         ]
     )
 

@@ -16,8 +16,8 @@ from gymnasium import spaces
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from sb3_sap.algorithms import ALGORITHMS, is_guided
-from sb3_sap.common.errors import is_number, nearest
+from sb3_sap.algorithms import guided_name
+from sb3_sap.common.errors import is_number
 from sb3_sap.common.functions import resolve
 from sb3_sap.comparison.code import lines
 from sb3_sap.comparison.decision import Comparison, write_evaluations
@@ -55,11 +55,11 @@ def compare(
     :param env: the id of an environment, or a function that makes one
     :param ap_function: f(s, a | s') or its dotted name; ``None``: the labels come from ``potential`` if there is one,
         else from ``info["permissible"]``
-    :param algo: RL Zoo's name of a guided algorithm, such as ``"sac_ap"``; ``None``: ``"sac_ap"`` for a ``Box`` of
-        actions, ``"dqn_ap"`` for ``Discrete`` ones
+    :param algo: RL Zoo's name of a guided algorithm or of its base, such as ``"ppo_ap"`` or ``"ppo"``; ``None``:
+        ``"sac_ap"`` for a ``Box`` of actions, ``"dqn_ap"`` for ``Discrete`` ones, ``"ppo_ap"`` for others
     :param potential: Φ or its dotted name; reward shaping with it is compared as well
     :param minutes: how long the comparison may take, about; the number of steps follows from it
-    :param steps: training steps of each run instead
+    :param steps: training steps of each run instead; an on-policy algorithm takes whole rollouts
     :param seeds: number of runs of each way, at least 2
     :param first_seed: their seeds count from here
     :param episodes: episodes of an evaluation
@@ -84,19 +84,23 @@ def compare(
         raise ValueError(f"`minutes` must be a number above 0, but is {minutes!r}.")
     console = console or Console()
     job = Job(env, dict(env_kwargs or {}), algo or "", dict(settings or {}), 0, 0, EVALUATIONS, episodes)
-    algo, policy = _algorithm(algo, job)
+    algo, policy, finite = _algorithm(algo, job)
     job = replace(job, algo=algo)
-    compared = ways(algo, potential is not None)
+    compared = ways(algo, potential is not None, finite)
     jobs = jobs or len(os.sched_getaffinity(0))
     runs = [(way, _labelled(job, way, ap_function, potential)) for way in compared]
     if steps is None:
         console.print("A short trial of each way tells how many steps fit into the time.")
         steps = steps_within(minutes, [trial for _, trial in runs], seeds, jobs)
-    console.print(f"{len(compared)} ways, {seeds} seeds each, {steps:,} steps, {jobs} side by side")
+    sized = replace(job, steps=steps).in_rollouts()
+    steps, evaluations, rollout = sized.steps, sized.evaluations, sized.rollout
+    whole = f" in rollouts of {rollout:,}" if rollout > 1 else ""
+    console.print(f"{len(compared)} ways, {seeds} seeds each, {steps:,} steps{whole}, {jobs} side by side")
     numbers = range(first_seed, first_seed + seeds)
     rows: list[dict[str, Any]] = []
     try:
-        _train([(way, replace(run, seed=n, steps=steps)) for n in numbers for way, run in runs], jobs, console, rows)
+        sized_runs = [(way, replace(run, steps=steps, evaluations=evaluations)) for way, run in runs]
+        _train([(way, replace(run, seed=n)) for n in numbers for way, run in sized_runs], jobs, console, rows)
     finally:
         if out is not None:
             write_evaluations(Path(out), pd.DataFrame(rows))  # also if a run fails, or after Ctrl-C
@@ -107,16 +111,16 @@ def compare(
     return result
 
 
-def _algorithm(algo: str | None, job: Job) -> tuple[str, str]:
-    """The algorithm, or that of the action space, and SB3's policy for the observations."""
-    known = [name for name in ALGORITHMS if is_guided(name)]
-    if not (algo is None or algo in known):
-        raise ValueError(f"`algo` = {algo!r} is not a guided algorithm: {nearest(algo, known)}")
+def _algorithm(algo: str | None, job: Job) -> tuple[str, str, bool]:
+    """The algorithm, or that of the action space, SB3's policy for the observations, and whether actions are finite."""
+    algo = None if algo is None else guided_name(algo)
     env = job.make_env()
-    policy = policy_for(env)
-    discrete = isinstance(env.action_space, spaces.Discrete)
+    space = env.action_space
+    finite = not isinstance(space, spaces.Box)
+    algo = algo or {spaces.Box: "sac_ap", spaces.Discrete: "dqn_ap"}.get(type(space), "ppo_ap")
+    policy = policy_for(env, algo)
     env.close()
-    return algo or ("dqn_ap" if discrete else "sac_ap"), policy
+    return algo, policy, finite
 
 
 def _labelled(job: Job, way: Way, ap_function: Any, potential: Any) -> Job:
@@ -126,7 +130,7 @@ def _labelled(job: Job, way: Way, ap_function: Any, potential: Any) -> Job:
         potential = resolve(potential, "potential")
         labels = {"ap_function": does_not_lower(potential), **labels}
         labels |= {"potential": potential} if way.name == "shaping" else {}
-    return replace(job, settings={**labels, **way.settings, **job.settings})
+    return replace(job, settings={**labels, **way.settings, **job.settings}, guided=way.guided)
 
 
 def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console, rows: list[dict[str, Any]]) -> None:
@@ -149,7 +153,7 @@ def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console, row
         Progress(*columns, console=console, disable=not console.is_terminal) as progress,
         ThreadPoolExecutor(side_by_side) as pool,
     ):
-        task = progress.add_task("evaluations", total=EVALUATIONS * len(jobs))
+        task = progress.add_task("evaluations", total=sum(job.evaluations for _, job in jobs))
         for way, job in jobs:
             pool.submit(run, way, job)
         try:

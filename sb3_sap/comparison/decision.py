@@ -111,7 +111,7 @@ class Comparison:
 
         table = self.evaluations.rename(columns={"way": "configuration"})
         names = [way.name for way in self.ways]
-        return line_figure(table, names, "step", "return", "training step", "mean return of the policy alone")
+        return line_figure(table, names, "step", "return", "training step", "mean return")
 
     def save(self, folder: Path) -> None:
         """Writes ``evaluations.csv``, ``table.csv``, ``curves.png``, ``decision.txt`` and ``train.py``."""

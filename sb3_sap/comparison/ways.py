@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from sb3_sap.algorithms import ALGORITHMS, base_of
+from sb3_sap.algorithms import GUIDED_ALGORITHMS, base_of
+from sb3_sap.benchmark.learners import CLASSES
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.presets import preset, preset_names
 
 
@@ -23,28 +25,40 @@ class Way:
     meaning: str
     settings: dict[str, Any] = field(default_factory=dict)
     code: str = ""
+    #: Whether it acts with the predictor, ``predict(..., guided=True)``, in evaluations and in use.
+    guided: bool = False
 
 
-def ways(algo: str, potential: bool) -> list[Way]:
+def ways(algo: str, potential: bool, finite: bool = False) -> list[Way]:
     """The ways that an algorithm knows, the simplest first.
 
     :param algo: RL Zoo's name of a guided algorithm
     :param potential: whether the user has given one
+    :param finite: whether the actions are finitely many, which an on-policy algorithm can mask
     """
-    cls = ALGORITHMS[algo].__name__
+    cls = GUIDED_ALGORITHMS[algo].__name__
+    on_policy = algo in ON_POLICY_ALGORITHMS
     penalty = preset("penalty", algo)
     # Without a penalty and without guidance, the algorithm equals its base to the bit, and counts the mistakes.
-    base = {**penalty, "penalty": 0.0}
+    base = {**penalty, "penalty": 0.0} | ({"predictor_epochs": 0} if on_policy else {})
     found = [
-        Way("base", f"{base_of(algo).upper()} alone, without the label", base),
+        Way("base", f"{CLASSES[base_of(algo)].partition(':')[2]} alone, without the label", base),
         Way("penalty", "the label as a reward penalty", penalty, f'**preset("penalty", {cls})'),
     ]
     if potential:
         code = f'**preset("penalty", {cls}) | {{"penalty": 0.0}}'
         found.append(Way("shaping", "the potential as reward shaping", base, code))
     if "loss" in preset_names(algo):
-        meaning = "the penalty, and a loss on the learned predictor that fades"
+        beside = "" if on_policy else "the penalty, and "
+        meaning = f"{beside}a loss on the learned predictor that fades"
         found.append(Way("loss", meaning, preset("loss", algo), f'**preset("loss", {cls})'))
-    guided = {"refit_growth": 0.005, "n_candidates": 32}
-    found.append(Way("guidance", "Algorithm 1 of the paper", guided, f"**{guided!r}"))
+    guided: dict[str, Any] = {"alpha": 1} if on_policy else {"refit_growth": 0.005, "n_candidates": 32}
+    code = f"**{guided!r}"
+    if not on_policy:
+        found.append(Way("guidance", "Algorithm 1 of the paper", guided, code))
+    elif finite:
+        # What the mask forbids is never tried, so that the policy alone may choose it.
+        found.append(Way("mask", "the learned predictor as a mask of the actions", guided, code, guided=True))
+    elif "loss" not in preset_names(algo):
+        found.append(Way("guidance", "the first draw that the learned predictor permits", guided, code))
     return found

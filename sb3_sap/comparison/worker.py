@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import cloudpickle
@@ -22,9 +23,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_sap.algorithms import ALGORITHMS
+from sb3_sap.algorithms import GUIDED_ALGORITHMS
 from sb3_sap.benchmark.process import SINGLE_THREADED
 from sb3_sap.evaluation.environments import make_env
+from sb3_sap.guidance.action_filter import GuidedPolicy
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
 #: Seed of the evaluation episodes, the same in every run.
 EVALUATION_SEED = 10_000
@@ -37,6 +40,7 @@ class Job:
 
     :param env: id of an environment, or a function that makes one
     :param settings: constructor arguments
+    :param guided: whether evaluations are guided by E
     """
 
     env: str | Callable[..., gym.Env[Any, Any]]
@@ -47,6 +51,27 @@ class Job:
     steps: int
     evaluations: int
     episodes: int
+    guided: bool = False
+
+    @property
+    def rollout(self) -> int:
+        """Steps after which the policy first changes, if it does not change at every step: 1, or a whole rollout."""
+        if self.algo not in ON_POLICY_ALGORITHMS:
+            return 1
+        default = inspect.signature(ON_POLICY_ALGORITHMS[self.algo]).parameters["n_steps"].default
+        given = self.settings.get("n_steps", default)
+        return given if isinstance(given, int) and given > 0 else 1  # others are refused by the constructor
+
+    def in_rollouts(self) -> Job:
+        """The job with whole rollouts, as many as it takes, and no more evaluations than there are rollouts."""
+        n = -(-self.steps // self.rollout)
+        return replace(self, steps=n * self.rollout, evaluations=min(self.evaluations, n))
+
+    @property
+    def evaluated_at(self) -> list[int]:
+        """The steps after which the policy is evaluated, at equal distances, and at the end of rollouts."""
+        due = [self.steps * (i + 1) // self.evaluations for i in range(self.evaluations)]
+        return [-(-step // self.rollout) * self.rollout for step in due]
 
     def make_env(self) -> gym.Env[Any, Any]:
         """A new environment."""
@@ -54,12 +79,12 @@ class Job:
 
 
 class Evaluations(BaseCallback):
-    """Evaluates the policy alone at equal distances, and reports each evaluation."""
+    """Evaluates the policy at equal distances, alone unless the job says otherwise, and reports each evaluation."""
 
     def __init__(self, job: Job, report: Callable[[dict[str, Any]], None]):
         super().__init__()
-        self._report, self._episodes = report, job.episodes
-        self._due = [job.steps * (i + 1) // job.evaluations for i in range(job.evaluations)]
+        self._report, self._episodes, self._guided = report, job.episodes, job.guided
+        self._due = job.evaluated_at
         self._env = DummyVecEnv([lambda: Monitor(job.make_env())])
 
     def _on_step(self) -> bool:
@@ -77,23 +102,25 @@ class Evaluations(BaseCallback):
     def _evaluate(self, step: int) -> None:
         self._env.seed(EVALUATION_SEED)
         began = time.monotonic()
-        mean, _ = evaluate_policy(self.model, self._env, self._episodes)
+        policy: Any = GuidedPolicy(self.model) if self._guided else self.model
+        mean, _ = evaluate_policy(policy, self._env, self._episodes)
         mistakes, others = self.model.knowledge.seen  # type: ignore[attr-defined]
         row = {"step": step, "return": float(cast(float, mean)), "mistakes": mistakes / max(1, mistakes + others)}
         self._report({**row, "took": time.monotonic() - began})
 
 
-def policy_for(env: gym.Env[Any, Any]) -> str:
+def policy_for(env: gym.Env[Any, Any], algo: str) -> str:
     """SB3's policy for the observations of an environment."""
+    memory = "Lstm" if algo == "ppo_lstm_ap" else ""
     if isinstance(env.observation_space, spaces.Dict):
-        return "MultiInputPolicy"
-    return "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
+        return f"MultiInput{memory}Policy"
+    return f"Cnn{memory}Policy" if is_image_space(env.observation_space) else f"Mlp{memory}Policy"
 
 
 def train(job: Job, report: Callable[[dict[str, Any]], None]) -> None:
     """Trains one run on the CPU with one thread."""
     env = job.make_env()
-    model = ALGORITHMS[job.algo](policy_for(env), env, seed=job.seed, device="cpu", **job.settings)
+    model = GUIDED_ALGORITHMS[job.algo](policy_for(env, job.algo), env, seed=job.seed, device="cpu", **job.settings)
     model.learn(job.steps, callback=Evaluations(job, report))
 
 

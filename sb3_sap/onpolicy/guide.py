@@ -23,6 +23,8 @@ from sb3_sap.predictor.network import PermissibilityPredictor
 
 #: Maximum number of pairs of a state and an action that E judges at once, which bounds the memory of its layers.
 PAIRS_AT_ONCE = 32_768
+#: Number of actions from which their share of E's first layer is computed once for all states.
+MANY_ACTIONS = 64
 
 
 class Guide:
@@ -59,7 +61,9 @@ class Guide:
         #: The known masks of the states in which actions are chosen, (n, k); ``None``: there are none, or the update
         #: evaluates actions that were chosen before.
         self.known_masks: Callable[[], BoolArray] | None = None
-        self._judged: dict[bytes, BoolArray] = {}  # E's verdicts on all actions of a state
+        self._judged: dict[bytes, int] = {}  # the row of each state in the next
+        self._table: BoolArray = np.zeros((0, 0), dtype=bool)  # E's verdicts on all actions, with room for more
+        self._verdicts_held = 0
         #: The known masks of the rollout's states.
         self.known: dict[bytes, BoolArray] = {}
         self._generator = th.Generator(device).manual_seed(seed)
@@ -115,9 +119,16 @@ class Guide:
         assert self.predictor is not None
         new = [row for row, state in enumerate(states) if state not in self._judged]
         if new:
-            judged = permitted(self.predictor, rows_of(obs, new), self.actions).cpu().numpy()
-            self._judged.update(zip((states[row] for row in new), judged, strict=True))
-        return np.stack([self._judged[state] for state in states])
+            unseen = obs if len(new) == len(states) else rows_of(obs, new)
+            judged = permitted(self.predictor, unseen, self.actions).cpu().numpy()
+            first = self._verdicts_held
+            self._verdicts_held += len(new)
+            if self._verdicts_held > len(self._table):
+                more = np.zeros((self._verdicts_held, judged.shape[1]), dtype=bool)
+                self._table = np.concatenate([self._table, more]) if first else more
+            self._table[first : self._verdicts_held] = judged
+            self._judged.update(zip((states[row] for row in new), range(first, self._verdicts_held), strict=True))
+        return self._table[[self._judged[state] for state in states]]
 
     def _known_of(self, states: list[bytes]) -> BoolArray | None:
         """The known masks, (n, k): those of now, or in an update those of the rollout."""
@@ -251,16 +262,19 @@ class Guide:
 def _log_density(distribution: Any, plain: th.Tensor, rows: Any = slice(None)) -> th.Tensor:
     """(m, N) log-densities of (m, N, action_dim) draws, before they are squashed, in the states of ``rows``."""
     normal = distribution.distribution
-    own = th.distributions.Normal(normal.mean[rows, None], normal.stddev[rows, None])
-    return own.log_prob(plain).sum(dim=2)  # type: ignore[no-any-return, no-untyped-call]
+    mean, deviation = normal.mean[rows, None], normal.stddev[rows, None]
+    # As torch's Normal computes it, without its checks, which take longer.
+    densities = -((plain - mean) ** 2) / (2 * deviation**2) - deviation.log() - math.log(math.sqrt(2 * math.pi))
+    return densities.sum(dim=2)  # type: ignore[no-any-return]
 
 
 def _rows_as_bytes(obs: Any) -> list[bytes]:
     """What tells each of n states from the others, for the policy, whose networks have single precision."""
     tensors = obs.values() if isinstance(obs, dict) else [obs]
     arrays = [(value.float() if value.is_floating_point() else value).cpu().numpy() for value in tensors]
-    rows = [[row.tobytes() for row in array] for array in arrays]
-    return [b"".join(parts) for parts in zip(*rows, strict=True)]
+    flat = [np.ascontiguousarray(array).reshape(len(array), -1).view(np.uint8) for array in arrays]
+    joined = np.concatenate(flat, axis=1)
+    return joined.view(f"V{joined.shape[1]}").ravel().tolist()
 
 
 @th.no_grad()
@@ -272,9 +286,11 @@ def permitted(predictor: PermissibilityPredictor, obs: Any, actions: th.Tensor) 
     :param actions: (k, action_dim)
     """
     features, k = predictor.features(obs), len(actions)
-    verdicts = [
-        predictor.logits(part.repeat_interleave(k, dim=0), actions.repeat(len(part), 1)).reshape(len(part), k) > 0
-        for part in th.split(features, max(1, PAIRS_AT_ONCE // k))
-    ]
-    mask = th.cat(verdicts)
+    parts = th.split(features, max(1, PAIRS_AT_ONCE // k))
+    if k < MANY_ACTIONS:
+        pairs = ((part.repeat_interleave(k, dim=0), actions.repeat(len(part), 1)) for part in parts)
+        logits = [predictor.logits(*pair).reshape(-1, k) for pair in pairs]
+    else:
+        logits = predictor.logits_of_each(parts, actions)
+    mask = th.cat(logits) > 0
     return mask | ~mask.any(dim=1, keepdim=True)

@@ -57,7 +57,8 @@ class MaskedDistribution(CategoricalDistribution):
     def __init__(self, log_probs: th.Tensor, mask: th.Tensor, space: spaces.Space[Any], actions: th.Tensor):
         super().__init__(len(actions))
         rejected = th.tensor(REJECTED_LOGIT, dtype=log_probs.dtype, device=log_probs.device)
-        self.distribution = Categorical(logits=th.where(mask, log_probs, rejected))
+        # The policy's own distribution has checked its logits.
+        self.distribution = Categorical(logits=th.where(mask, log_probs, rejected), validate_args=False)
         self.space = space
         self.actions = actions
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 import torch as th
@@ -183,7 +183,10 @@ class PermissibilityPredictor(BaseModel):
 
         With parts, an action is permissible unless a part that is accurate enough is not.
         """
-        of_parts = self.part_logits(features, actions)
+        return self._of_all(self.part_logits(features, actions))
+
+    def _of_all(self, of_parts: th.Tensor) -> th.Tensor:
+        """(n,) logits of the whole action from (n, k) of its parts."""
         if not self.parts:
             return of_parts.squeeze(1)
         return of_parts.masked_fill(~self.trusted, th.inf).min(dim=1).values
@@ -198,6 +201,29 @@ class PermissibilityPredictor(BaseModel):
     def trusted(self) -> th.Tensor:
         """(k,) which parts are accurate enough, each as the whole action is without parts (section 4.3)."""
         return self.accuracies >= SUFFICIENT_ACCURACY
+
+    def logits_of_each(self, batches: Sequence[th.Tensor], actions: th.Tensor) -> list[th.Tensor]:
+        """(n, k) logits of k actions in the n states of each batch.
+
+        For many actions far faster than :meth:`logits`: of the first layer, whose inputs are mostly those of a one-hot
+        action, features and actions have their shares once. The logits differ by rounding alone.
+
+        :param batches: (n, features_dim) features
+        :param actions: (k, action_dim), scaled
+        """
+        first, *others = cast(Iterable[Any], self.head)
+        of_features, of_actions = first.weight.tensor_split([batches[0].shape[1]], dim=1)
+        if isinstance(self.action_space, spaces.Discrete):
+            share = of_actions.t()[actions.flatten().long()]
+        else:
+            share = F.linear(_encoded(self.action_space, actions).to(of_actions.dtype), of_actions)
+        found = []
+        for batch in batches:
+            hidden = (F.linear(batch, of_features, first.bias)[:, None] + share).flatten(0, 1)
+            for layer in others:
+                hidden = layer(hidden)
+            found.append(self._of_all(hidden).reshape(len(batch), -1))
+        return found
 
     def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of n observations and (n, action_dim) scaled actions."""

@@ -9,6 +9,7 @@ from typing import Any
 import rl_zoo3.utils
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from sb3_contrib import TRPO
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_sap.algorithms import ALGORITHMS
@@ -19,6 +20,7 @@ from sb3_sap.zoo.spaces import (
     convert_crossq_params,
     guided_converter,
     guided_sampler,
+    on_policy_sampler,
     sample_crossq_params,
 )
 
@@ -40,7 +42,12 @@ def register() -> None:
             converters[name] = guided_converter(converters[base])
     for name, on_policy in ON_POLICY_ALGORITHMS.items():
         base = next(BASES[cls] for cls in on_policy.__mro__ if cls in BASES)
-        ALGOS[name], samplers[name], converters[name] = on_policy, samplers[base], converters[base]
+        has_loss = not issubclass(on_policy, TRPO)  # whose step has no place for it
+        ALGOS[name] = on_policy
+        samplers[name], converters[name] = (
+            on_policy_sampler(samplers[base], has_loss),
+            guided_converter(converters[base]),
+        )
 
 
 @contextmanager

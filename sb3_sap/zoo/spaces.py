@@ -1,4 +1,4 @@
-"""Optuna's search spaces for guided algorithms: alpha and t_k first, then the predictor, then the base's own space."""
+"""Optuna's search spaces for guided algorithms: guidance first, then the predictor, then the base's own space."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ T_K_SHARES = (1 / 60, 1 / 3)
 DEFAULT_STEPS = 3_000
 #: Settings sampled as powers of 2, because small differences do not matter.
 POWERS = ("n_candidates", "dataset_size")
+#: Settings of guidance that are sampled as they are.
+OWN = ("alpha", "t_k", "alpha_low", "actor_permissibility_coef", "permissibility_coef", "predictor_epochs")
 #: Prefix of a trial's parameters that belong to ``predictor_kwargs``.
 PREDICTOR_PREFIX = "predictor_"
 
@@ -41,6 +43,24 @@ def sample_predictor(trial: optuna.Trial) -> Params:
     return {
         "actor_permissibility_coef": trial.suggest_float("actor_permissibility_coef", 0.0, 3.0),
         "alpha_low": trial.suggest_float("alpha_low", 0.0, 1.0),
+        **_sample_fits(trial),
+    }
+
+
+def sample_on_policy(trial: optuna.Trial, has_loss: bool) -> Params:
+    """Settings of an on-policy algorithm. alpha 0 without the loss is no guidance.
+
+    :param has_loss: whether the algorithm has a place for the loss
+    """
+    sampled: Params = {"alpha": trial.suggest_categorical("alpha", [0, 1])}
+    if has_loss:
+        sampled["permissibility_coef"] = trial.suggest_float("permissibility_coef", 0.0, 5.0)
+    sampled["predictor_epochs"] = trial.suggest_float("predictor_epochs", 1.0, 20.0, log=True)
+    return sampled | _sample_fits(trial)
+
+
+def _sample_fits(trial: optuna.Trial) -> Params:
+    return {
         "n_candidates_pow": trial.suggest_int("n_candidates_pow", 4, 8),
         "dataset_size_pow": trial.suggest_int("dataset_size_pow", 7, 11),
         "predictor_optimizer_class": trial.suggest_categorical("predictor_optimizer_class", ["Adam", "SGD"]),
@@ -61,6 +81,16 @@ def guided_sampler(base: Sampler) -> Sampler:
     return sample
 
 
+def on_policy_sampler(base: Sampler, has_loss: bool) -> Sampler:
+    """The space of a guided on-policy algorithm, given its base's."""
+
+    def sample(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+        own = _convert_own(sample_on_policy(trial, has_loss))
+        return own | base(trial, n_actions, n_envs, additional_args)
+
+    return sample
+
+
 def guided_converter(base: Converter) -> Converter:
     """Turns the numbers of a stored trial into hyperparameters, so that ``--trial-id`` replays it."""
 
@@ -73,14 +103,13 @@ def guided_converter(base: Converter) -> Converter:
 
 
 def _is_own(name: str) -> bool:
-    own = ("alpha", "t_k", "alpha_low", "actor_permissibility_coef", *(f"{power}_pow" for power in POWERS))
-    return name in own or name.startswith(PREDICTOR_PREFIX)
+    return name in OWN or name.removesuffix("_pow") in POWERS or name.startswith(PREDICTOR_PREFIX)
 
 
 def _convert_own(sampled: Params) -> Params:
     params: Params = {}
     for name, value in sampled.items():
-        if name.startswith(PREDICTOR_PREFIX):
+        if name.startswith(PREDICTOR_PREFIX) and name not in OWN:
             params.setdefault("predictor_kwargs", {})[name.removeprefix(PREDICTOR_PREFIX)] = value
         elif name.removesuffix("_pow") in POWERS:
             params[name.removesuffix("_pow")] = 2**value

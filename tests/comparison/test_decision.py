@@ -10,7 +10,8 @@ from sb3_sap.comparison.code import lines
 from sb3_sap.comparison.decision import Comparison
 from sb3_sap.comparison.pilot import _measure, steps_within
 from sb3_sap.comparison.ways import ways
-from sb3_sap.comparison.worker import Job
+from sb3_sap.comparison.worker import Job, policy_for, train
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
 
 def compared(returns, algo="sac_ap"):
@@ -82,6 +83,60 @@ def test_code_of_every_way_can_be_run(algo, monkeypatch, tmp_path):
         assert scope["model"].num_timesteps >= 12
 
 
+@pytest.mark.parametrize("n_actions", [None, 3])
+@pytest.mark.parametrize("algo", ON_POLICY_ALGORITHMS)
+def test_code_of_every_way_of_an_on_policy_algorithm_can_be_run(algo, n_actions, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gymnasium.make", lambda name: Line(n_actions=n_actions))
+    settings = {"n_steps": 8, "policy_kwargs": {"net_arch": [8]}} | ({} if algo == "a2c_ap" else {"batch_size": 4})
+    if algo == "ppo_lstm_ap":
+        settings["policy_kwargs"]["lstm_hidden_size"] = 8
+    job = Job("Line-v0", {}, algo, settings, 0, 12, 10, 1).in_rollouts()
+    for way in ways(algo, potential=True, finite=n_actions is not None):
+        policy = policy_for(Line(), algo)
+        code = lines(way, job, policy, "toy.towards_centre", "toy.centred").replace(", progress_bar=True", "")
+        assert code.count("\n") < 20
+        assert ("guided=True" in code) == (way.name == "mask")
+        scope = {}
+        exec(code, scope)
+        assert scope["model"].num_timesteps == 16
+        assert type(scope["model"]).__name__.endswith("AP") == (way.name != "base")
+
+
+@pytest.mark.parametrize(
+    ("algo", "finite", "last"),
+    [
+        ("ppo_ap", True, ["loss", "mask"]),
+        ("ppo_ap", False, ["loss"]),
+        ("trpo_ap", True, ["mask"]),
+        ("trpo_ap", False, ["guidance"]),
+    ],
+)
+def test_ways_of_on_policy_algorithms(algo, finite, last):
+    found = ways(algo, potential=True, finite=finite)
+    assert [way.name for way in found] == ["base", "penalty", "shaping", *last]
+    assert found[0].meaning == f"{algo.removesuffix('_ap').upper()} alone, without the label"
+
+
+def test_on_policy_runs_have_whole_rollouts_and_are_evaluated_at_their_ends():
+    def sized(steps, **settings):
+        return Job("x", {}, "ppo_ap", settings, 0, steps, 10, 1).in_rollouts()
+
+    few, many = sized(3_000, n_steps=512), sized(13 * 2_048)
+    assert (few.steps, few.evaluated_at) == (3_072, [512, 1_024, 1_536, 2_048, 2_560, 3_072])
+    assert [step // 2_048 for step in many.evaluated_at] == [2, 3, 4, 6, 7, 8, 10, 11, 12, 13]
+    off_policy = Job("x", {}, "sac_ap", {}, 0, 1_005, 10, 1).in_rollouts()
+    assert (off_policy.steps, off_policy.evaluated_at[:2]) == (1_005, [100, 201])
+
+
+def test_on_policy_run_reports_after_its_updates():
+    reports, settings = [], {"n_steps": 8, "batch_size": 4, "ap_function": towards_centre}
+    job = Job(Line, {"n_actions": 3}, "ppo_ap", settings, 0, 24, 10, 1, guided=True).in_rollouts()
+    train(job, reports.append)
+    assert [row["step"] for row in reports] == [8, 16, 24]
+    assert all(0 <= row["mistakes"] <= 1 for row in reports)
+
+
 def test_setting_of_the_user_goes_before_that_of_a_way(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("gymnasium.make", lambda name: Line())
@@ -91,6 +146,15 @@ def test_setting_of_the_user_goes_before_that_of_a_way(monkeypatch, tmp_path):
         code = lines(way, job, "MlpPolicy", "toy.towards_centre", "toy.centred")
         exec(code.replace(", progress_bar=True", ""), scope)
         assert scope["model"].refit_growth == 0.125
+
+
+def test_code_of_the_base_has_no_settings_of_guidance(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("gymnasium.make", lambda name: Line())
+    job = Job("Line-v0", {}, "ddpg_ap", {"learning_starts": 5, "batch_size": 4, "refit_growth": 0.125}, 0, 12, 10, 1)
+    code = lines(ways("ddpg_ap", potential=False)[0], job, "MlpPolicy", "toy.towards_centre", None)
+    assert "refit_growth" not in code
+    exec(code.replace(", progress_bar=True", ""), {})
 
 
 def test_classes_in_settings_are_imported(monkeypatch, tmp_path):
@@ -127,7 +191,7 @@ def test_code_names_functions_of_a_notebook_without_importing_them():
         ({"seeds": 1}, "^`seeds` must be a whole number of at least 2, but is 1"),
         ({"minutes": 0}, "^`minutes` must be a number above 0, but is 0"),
         ({"steps": 0}, "^`steps` must be a whole number of at least 1, but is 0"),
-        ({"algo": "sac"}, "^`algo` = 'sac' is not a guided algorithm: did you mean 'sac_ap'"),
+        ({"algo": "sacc"}, "^`algo` = 'sacc' has no guided algorithm: did you mean 'sac_ap'"),
         ({"ap_function": "toy.missing"}, "^`ap_function`: 'toy.missing' cannot be imported"),
     ],
 )
@@ -147,6 +211,15 @@ def test_steps_follow_from_the_time(monkeypatch):
         steps_within(1, jobs, seeds=4, jobs=2)
     # The trials themselves take a minute of ten.
     assert steps_within(10, jobs, seeds=4, jobs=2) == int((270 - 27) / 0.03)
+
+
+def test_on_policy_steps_that_fit_are_whole_rollouts_and_at_least_four(monkeypatch):
+    monkeypatch.setattr("sb3_sap.comparison.pilot._measure", lambda job, warm_up: (0.01, 0.1, 4.0))
+    monkeypatch.setattr("sb3_sap.comparison.pilot.time.monotonic", lambda: 0.0)
+    jobs = [Job("x", {}, "ppo_ap", {}, 0, 0, 10, 5)] * 3
+    assert steps_within(10, jobs, seeds=4, jobs=2) == 4 * 2_048  # of 9,100
+    with pytest.raises(ValueError, match=r"^8 minutes suffice for 7100 steps of each run, .* give at least 10 minutes"):
+        steps_within(8, jobs, seeds=4, jobs=2)
 
 
 def test_steps_before_learning_do_not_count_as_trained(monkeypatch):

@@ -8,6 +8,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from torch import nn
 
 from sb3_sap import PermissibilityPredictor
+from sb3_sap.common.spaces import joint_actions
 from sb3_sap.predictor.knowledge import LabelledActions
 
 OBS, ACTIONS = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
@@ -199,3 +200,13 @@ def test_dropout_is_active_in_fits_only_and_leaves_the_global_generator_unchange
     with e._training():
         losses.add(e.loss(obs, actions, th.tensor(EXAMPLES.labels)).item())
     assert len(losses) == 2
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(80), spaces.MultiDiscrete([16, 5]), spaces.MultiBinary(7)])
+def test_many_actions_are_judged_as_each_of_them_is(space):
+    e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), space, net_arch=[8, 8])
+    features, actions = th.rand(4, 3), joint_actions(space)
+    actions = th.as_tensor(actions.reshape(len(actions), -1))
+    k = len(actions)
+    each = e.logits(features.repeat_interleave(k, dim=0), actions.repeat(4, 1)).reshape(4, k)
+    th.testing.assert_close(th.cat(e.logits_of_each(features.split(3), actions)), each)

@@ -8,6 +8,7 @@ from quick_runs import ENV
 
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.cli.main import main
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.presets import load_config
 from sb3_sap.zoo.configs import check_hyperparameters
 
@@ -94,7 +95,7 @@ def test_frames_can_be_stacked_without_normalised_observations(algo, settings):
     check_hyperparameters(algo, settings, "own.yml")
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", [*ALGORITHMS, *ON_POLICY_ALGORITHMS])
 def test_shipped_configurations_are_valid(algo):
     for name, entry in load_config(algo).items():
         check_hyperparameters(algo, entry, name)

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_sap import DDPGAP
 from sb3_sap.algorithms import ALGORITHMS
 from sb3_sap.cli.main import main
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.zoo.registration import small_buffers
 
 
@@ -160,6 +161,20 @@ def test_every_algorithm_trains_and_tunes(algo):
     command = ["optimize", "--algo", algo, "--env", env, "-n", "20", "--eval-episodes", "1", "--n-trials", "1"]
     assert main([*command, "--study-name", "whole", "--no-optim-plots"]) == 0
     assert "| 0 |" in (Path("logs") / algo / f"report_{env.replace('/', '-')}_whole" / "report.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ON_POLICY_ALGORITHMS)
+def test_every_on_policy_algorithm_trains_tunes_and_replays_a_trial(algo):
+    which = ["--algo", algo, "--env", "MountainCar-v0"]
+    label = "ap_function:'sb3_sap.tasks.mountain_car'"
+    assert main(["train", *which, "-n", "64", "--eval-freq", "-1", "-params", label, "n_steps:32"]) == 0
+    assert main(["enjoy", *which, "--no-render", "-n", "5"]) == 0
+    study = ["--study-name", "whole", "--storage", "study.log"]
+    command = ["train", *which, "-n", "32", "-optimize", "--n-trials", "2", "--eval-episodes", "1", "--no-optim-plots"]
+    assert main([*command, "--n-evaluations", "1", *study, "-params", label]) == 0
+    assert "| 1 |" in (Path("logs") / algo / "report_MountainCar-v0_whole" / "report.md").read_text()
+    assert main(["train", *which, "-n", "32", "--eval-freq", "-1", *study, "--trial-id", "0", "-params", label]) == 0
 
 
 @pytest.mark.parametrize("arguments", [["plot"], ["plot", "nothing"]])

@@ -14,6 +14,8 @@ from sb3_sap.cli.main import main
 from sb3_sap.evaluation.laps import ENVIRONMENTS, drive_lap
 from sb3_sap.evaluation.policies import load_policy
 from sb3_sap.guidance.mixin import ActionPermissibilityMixin
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
+from sb3_sap.presets import load_config
 from sb3_sap.zoo.configs import check_hyperparameters
 from sb3_sap.zoo.spaces import t_k_range
 from sb3_sap.zoo.storages import SeededByTrial, is_surplus, open_storage, without_password
@@ -38,6 +40,18 @@ def test_search_space_begins_with_alpha_and_t_k_and_trials_convert_to_what_was_s
         check_hyperparameters(algo, sampled, "the search space")
         assert 50 <= sampled["t_k"] <= 1000
     assert t_k_range(15_000) == (250, 5000)
+
+
+@pytest.mark.parametrize("algo", ON_POLICY_ALGORITHMS)
+def test_trials_of_on_policy_algorithms_convert_to_what_was_sampled(algo):
+    trial = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1)).ask()
+    sampled = HYPERPARAMS_SAMPLER[algo](trial, 1, 1, {})
+    assert HYPERPARAMS_CONVERTER[algo](trial.params) == sampled
+    check_hyperparameters(algo, load_config(algo)["default"] | sampled, "the search space")
+    assert sampled["alpha"] in (0, 1)
+    assert 1 <= sampled["predictor_epochs"] <= 20
+    assert ("permissibility_coef" in sampled) == (algo != "trpo_ap")
+    assert set(sampled["predictor_kwargs"]) == {"optimizer_class", "learning_rate", "weight_decay"}
 
 
 def test_trial_samples_the_same_in_every_worker():

@@ -6,7 +6,8 @@ A page names the source, and the script fills what lies between the two comments
     <!-- table: presets --> ... <!-- end -->
     <!-- code: examples/quick_start.py --> ... <!-- end -->
 
-The first is the first table of a page of results, or the named rows of it in the order given; the second is made from
+The first is the first table of a page of results, or the named rows of it in the order given, and with `columns:` after
+them the named columns; the second is made from
 zoo_configs; the third is a whole file.
 """
 
@@ -26,7 +27,8 @@ PAGES = [
     *(page for folder in ("docs", "docs/algorithms") for page in sorted((ROOT / folder).glob("*.md"))),
 ]
 MARKER = re.compile(
-    r"(?P<begin><!-- (?P<kind>table|code): (?P<source>\S+)(?: rows: (?P<rows>.+?))? -->\n).*?(?P<end><!-- end -->)",
+    r"(?P<begin><!-- (?P<kind>table|code): (?P<source>\S+)"
+    r"(?: rows: (?P<rows>.+?))?(?: columns: (?P<columns>.+?))? -->\n).*?(?P<end><!-- end -->)",
     re.DOTALL,
 )
 
@@ -37,10 +39,11 @@ def first_table(path: Path) -> list[str]:
     return f"|{after}".partition("\n\n")[0].strip().splitlines()
 
 
-def table_of_results(source: str, rows: str | None) -> str:
-    """A table of results, or the rows whose first cells are given, as a shell would split them.
+def table_of_results(source: str, rows: str | None, columns: str | None) -> str:
+    """A table of results, or the rows whose first cells are given, and the columns whose headings are, as a shell would
+    split them.
 
-    :raise ValueError: for a row that the table does not have
+    :raise ValueError: for a row or a column that the table does not have
     """
     header, line, *body = first_table(RESULTS / source)
     if rows is not None:
@@ -49,7 +52,12 @@ def table_of_results(source: str, rows: str | None) -> str:
         if missing := [name for name in wanted if name not in named]:
             raise ValueError(f"{source} has no row {missing[0]!r}: its rows are {', '.join(map(repr, named))}.")
         body = [named[name] for name in wanted]
-    return "\n".join([header, line, *body])
+    lines = [header, line, *body]
+    if columns is not None:
+        cells = [[cell.strip() for cell in row.strip("| ").split("|")] for row in lines]
+        chosen = [cells[0].index(name) for name in shlex.split(columns)]
+        lines = [f"| {' | '.join(row[number] for number in chosen)} |" for row in cells]
+    return "\n".join(lines)
 
 
 def table_of_presets() -> str:
@@ -74,7 +82,7 @@ def filled(page: Path) -> str:
         if match["source"] == "presets":
             content = table_of_presets()
         else:
-            content = table_of_results(match["source"], match["rows"])
+            content = table_of_results(match["source"], match["rows"], match["columns"])
         return f"{match['begin']}\n{content}\n\n{match['end']}"
 
     return MARKER.sub(fill, page.read_text(encoding="utf-8"))

@@ -160,6 +160,7 @@ def test_evaluation_of_discrete_actions_and_goals():
     assert row["permissible"] == 1.0  # it stands still
 
 
+@pytest.mark.slow
 def test_one_run_yields_everything():
     result = train_and_evaluate(
         run("ddpg_ap:task[learning_starts=20,min_per_class=2]", steps=40, episodes=["10000"]), 0.0

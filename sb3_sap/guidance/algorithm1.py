@@ -13,7 +13,7 @@ from stable_baselines3.common.noise import ActionNoise
 from sb3_sap.common.arrays import FloatArray, rows_of
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.torch_utils import flush_denormals
-from sb3_sap.guidance.candidates import SELECTIONS, choose
+from sb3_sap.guidance.candidates import SELECTIONS, choose, only_in
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.values import q_values
 from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
@@ -110,8 +110,10 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         self.logger.record_mean("sap/rejection_rate", len(rejected) / len(consulted))
         if len(rejected) == 0:
             return None
-        others = None if part is None else (actions[rejected], self.parts.indices[part])
-        candidates, allowed = self.sample_candidates(rejected, n_envs, others)  # line 8
+        candidates, allowed = self.sample_candidates(rejected, n_envs)  # line 8
+        if part is not None:
+            candidates = only_in(actions[rejected], self.parts.indices[part], candidates)
+            allowed = self.allowed_candidates(rows_of(self.raw_last_obs(), rejected), candidates)
         candidate_verdicts = query_candidates(self.predictor, features[rejected], candidates, part)
         permissible = allowed & (candidate_verdicts > 0)  # line 9
         found = permissible.any(axis=1)  # line 10

@@ -15,7 +15,7 @@ from sb3_sap.common.arrays import BoolArray, FloatArray, rows_of
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.random import make_rng
-from sb3_sap.guidance.candidates import candidate_actions, choose, only_in
+from sb3_sap.guidance.candidates import candidate_actions, choose
 from sb3_sap.guidance.constraints import ActionConstraint, query_constraint
 from sb3_sap.guidance.masked_values import MaskedValuesMixin
 from sb3_sap.guidance.masks import PermissibleActions, mask_source
@@ -107,21 +107,10 @@ class ConstrainedExplorationMixin(MaskedValuesMixin):
                     action = self.unscale_actions(scaled)
         return action, scaled
 
-    def sample_candidates(
-        self,
-        rows: np.ndarray[Any, Any],
-        n_envs: int,
-        varied: tuple[np.ndarray[Any, Any], tuple[int, ...]] | None = None,
-    ) -> tuple[np.ndarray[Any, Any], BoolArray]:
-        """A_st of the environments in ``rows``, (m, N, action_dim) scaled, and which are allowed, (m, N).
-
-        :param varied: (m, action_dim) scaled actions, and the dimensions in which the candidates differ from them;
-            ``None``: in all
-        """
+    def sample_candidates(self, rows: np.ndarray[Any, Any], n_envs: int) -> tuple[np.ndarray[Any, Any], BoolArray]:
+        """A_st of the environments in ``rows``, (m, N, action_dim) scaled, and which are allowed, (m, N)."""
         low, high = (bound.reshape(n_envs, -1)[rows] for bound in self._allowed_interval(n_envs))
         candidates = candidate_actions(self.exploration_rng, self.action_space, low, high, self.n_candidates)
-        if varied is not None:
-            candidates = only_in(*varied, candidates)
         return candidates, self.allowed_candidates(rows_of(self.raw_last_obs(), rows), candidates)
 
     def allowed_candidates(self, raw_obs: Any, candidates: np.ndarray[Any, Any]) -> BoolArray:

@@ -196,6 +196,7 @@ def test_environment_that_ignores_its_seed_gets_no_trials_of_actions():
     assert report.permissible_rate > 0
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_report_and_global_generators_are_unchanged():
     th.manual_seed(3)
     before = th.rand(1)
@@ -324,6 +325,7 @@ def energy_did_not_fall(obs, actions, next_obs):
     return energy(next_obs) >= energy(obs)
 
 
+@pytest.mark.slow
 def test_actions_against_the_motion_are_forbidden_in_mountain_car(monkeypatch):
     monkeypatch.setattr(classifier, "FITS", 120)
     env = gym.make("MountainCarContinuous-v0")

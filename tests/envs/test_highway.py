@@ -178,6 +178,7 @@ def test_same_start_and_actions_give_the_same_states() -> None:
     assert runs[0] == runs[1]
 
 
+@pytest.mark.slow
 def test_environments_in_subprocesses_give_the_same_observations() -> None:
     single, workers = (
         make_vec_env(

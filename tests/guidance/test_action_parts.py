@@ -269,6 +269,7 @@ def test_on_policy(env):
     assert (model.predictor.accuracies > 0.7).all()
 
 
+@pytest.mark.slow
 def test_check_is_of_each_part(capsys):
     reports = check_permissibility(Plane(), n_steps=200, action_parts=PARTS)
     assert list(reports) == ["x", "y"]

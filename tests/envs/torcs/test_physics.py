@@ -78,6 +78,7 @@ def test_places_off_the_road_and_factors_out_of_range_are_refused(torcs):
             Physics("g-track-3", **factors)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("localedef") is None, reason="localedef is not installed")
 def test_decimal_comma_of_a_locale_changes_no_number(torcs, tmp_path):
     """TORCS reads numbers with strtod, to which "0.5" is then 0: Wheel-2 would be 53 m shorter."""

@@ -33,8 +33,8 @@ from sb3_sap.predictor.callbacks import PermissibilityCallback
 
 PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
-    *("ddpg:base+loss", "td3:base+loss", "sac:base+loss", "tqc:base+loss"),
-    *("ddpg:base+penalty", "td3:base+penalty", "sac:base+penalty", "tqc:base+penalty"),
+    *("td3:fast[teaching_growth=null]", "sac:fast[teaching_growth=0]"),
+    *("td3:base+loss", "sac:base+loss"),
 )
 #: Bases for ``--bare``; those with discrete actions learn MountainCar, the others lane keeping on TORCS.
 BARE = ("ddpg", "td3", "sac", "tqc", "crossq", "dqn", "qrdqn")

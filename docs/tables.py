@@ -54,7 +54,7 @@ def table_of_results(source: str, rows: str | None, columns: str | None) -> str:
         body = [named[name] for name in wanted]
     lines = [header, line, *body]
     if columns is not None:
-        cells = [[cell.strip() for cell in row.strip("| ").split("|")] for row in lines]
+        cells = [[cell.strip() for cell in row.strip().removeprefix("|").removesuffix("|").split("|")] for row in lines]
         chosen = [cells[0].index(name) for name in shlex.split(columns)]
         lines = [f"| {' | '.join(row[number] for number in chosen)} |" for row in cells]
     return "\n".join(lines)

@@ -12,7 +12,6 @@ python measurements/on_policy_cost.py [--cases cartpole actions torcs]   # write
 
 import argparse
 import time
-from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from step_cost import seconds, timed
 
 from sb3_sap import PPOAP, preset
 from sb3_sap.benchmark.provenance import provenance
@@ -37,7 +37,6 @@ ACTIONS = 1_000
 #: Steps in which E is fitted more often than later.
 FIRST_STEPS = 2_048
 PARTS = ("labels", "fit E", "validate E", "guide", "loss")
-seconds: defaultdict[str, float] = defaultdict(float)
 
 
 class Target(gym.Env[Any, Any]):
@@ -106,17 +105,6 @@ TITLES = {
     "actions": f"{ACTIONS:,} actions",
     "torcs": "lane keeping on TORCS",
 }
-
-
-def timed(name: str, function: Any) -> Any:
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        begun = time.process_time()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            seconds[name] += time.process_time() - begun
-
-    return wrapper
 
 
 def watch_the_parts() -> None:

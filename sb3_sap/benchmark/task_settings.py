@@ -39,6 +39,7 @@ GUIDANCE = (
     | {"predictor_epochs"}
 ) - {
     "ap_function",
+    "action_parts",
     "event",
     "horizon",
     "potential",

@@ -58,6 +58,7 @@ def _add_labels(command: argparse.ArgumentParser) -> None:
     command.add_argument("--env", required=True, metavar="ENV_ID", help="environment of the transitions")
     command.add_argument("--env-kwargs", type=read_yaml, default={}, metavar="YAML", help="its arguments")
     command.add_argument("--ap-function", metavar="MODULE.FUNCTION", help="f(s, a | s'); by default labels of the log")
+    command.add_argument("--action-parts", type=read_yaml, metavar="YAML", help="parts of the action with own labels")
     command.add_argument("--columns", type=Path, metavar="FILE", help="YAML file that names the columns of a table")
 
 
@@ -76,7 +77,8 @@ def _model(options: argparse.Namespace, **settings: Any) -> Any:
         architecture["features_extractor_class"] = RescaleExtractor
     if algorithm is not PPOAP:
         settings["buffer_size"] = 1
-    settings |= {"ap_function": options.ap_function, "predictor_kwargs": architecture}
+    settings |= {"ap_function": options.ap_function, "action_parts": options.action_parts}
+    settings |= {"predictor_kwargs": architecture}
     return algorithm(policy, env, device="cpu", **settings)
 
 
@@ -117,6 +119,7 @@ def _evaluate(options: argparse.Namespace, console: Console) -> int:
 def _show(options: argparse.Namespace, console: Console) -> int:
     predictor = PermissibilityPredictor.load(options.file, "cpu")
     accuracy, statistics = predictor.about.get("accuracy", math.nan), predictor.about.get("statistics")
+    of_parts = zip(predictor.parts.names, predictor.accuracies.tolist(), strict=True) if predictor.parts else ()
     table = Table("", str(options.file))
     for name, value in {
         "observations": predictor.observation_space,
@@ -126,6 +129,7 @@ def _show(options: argparse.Namespace, console: Console) -> int:
         "parameters": f"{sum(p.numel() for p in predictor.parameters()):,}",
         "gradient steps": f"{int(predictor.n_updates):,}",
         "balanced accuracy": "not known" if math.isnan(accuracy) else f"{accuracy:.3f}",
+        **{f"  of {name}": "not known" if math.isnan(one) else f"{one:.3f}" for name, one in of_parts},
     }.items():
         table.add_row(name, str(value))
     console.print(table)

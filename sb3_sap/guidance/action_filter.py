@@ -54,7 +54,9 @@ def guided_prediction(
     if not model.discrete:
         proposed = model.policy.scale_action(proposed)
     flat = proposed.reshape(len(proposed), -1)
-    for part in range(len(model.parts)) if model.parts else (None,):
+    # What is known before the step is about the whole action, which comes last.
+    whole: tuple[int | None, ...] = (None,) if not model.parts or model._permissible_actions is not None else ()
+    for part in (*(model.predictor.judged_parts if model.parts else ()), *whole):
         flat = _repaired(model, obs, raw, flat, part)
     changed = (flat != proposed.reshape(flat.shape)).any(axis=1)
     if not changed.any():

@@ -85,7 +85,7 @@ class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationM
         shape = actions.shape
         guided = actions.reshape(len(actions), -1)
         changed = False
-        for part in range(len(self.parts)) if self.parts else (None,):
+        for part in self.predictor.judged_parts if self.parts else (None,):
             repaired = self._guide_part(guided, part)
             if repaired is not None:
                 guided, changed = repaired, True

@@ -198,6 +198,11 @@ class PermissibilityPredictor(BaseModel):
         return self.head(th.cat([features, actions.to(features.dtype)], dim=1))  # type: ignore[no-any-return]
 
     @property
+    def judged_parts(self) -> list[int]:
+        """The parts whose output was fitted and validated; others have not been seen to err, or to be right."""
+        return th.where(~self.accuracies.isnan())[0].tolist()
+
+    @property
     def trusted(self) -> th.Tensor:
         """(k,) which parts are accurate enough, each as the whole action is without parts (section 4.3)."""
         return self.accuracies >= SUFFICIENT_ACCURACY

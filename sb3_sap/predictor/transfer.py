@@ -78,6 +78,12 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         if isinstance(predictor, (str, Path)):
             predictor = PermissibilityPredictor.load(predictor, self.device)
         check_same_spaces(predictor, self.observation_space, self.action_space)
+        own, other = self.parts.as_dict(), predictor.parts.as_dict()
+        if own != other:
+            raise ValueError(
+                f"The AP predictor has the `action_parts` {other}, but this model has {own}: give the model those of "
+                "the predictor, and an AP function that labels them."
+            )
         check_statistics(predictor.about.get("statistics"), self.get_vec_normalize_env())
         self.predictor, self._predictor_architecture = make_predictor(self, {}, predictor)
         # `load` builds the same predictor.

@@ -89,10 +89,7 @@ def transitions_of(arrays: Mapping[str, Any]) -> Transitions:
             )
     for name in ("dones", "truncated", "labels"):
         if name in given:
-            shape = given[name].shape
-            given[name] = as_bool(name, given[name].ravel())
-            if name == "labels" and len(shape) == 2 and shape[1] > 1:
-                given[name] = given[name].reshape(shape)
+            given[name] = as_bool(name, given[name])
     if "truncated" in given:  # what was cut off has ended
         given["dones"] = given["truncated"] | given.get("dones", np.zeros(n, dtype=bool))
     if "rewards" in given:
@@ -209,11 +206,12 @@ def _finite(values: Any, n: int) -> BoolArray:
 
 
 def as_bool(name: str, values: np.ndarray[Any, Any]) -> BoolArray:
-    """(n,) bool, of bool or of 0 and 1.
+    """(n,) bool, or (n, k) if there are several columns, of bool or of 0 and 1.
 
     :raise ValueError: for anything else
     """
-    values = values.reshape(len(values))
+    if values.size == len(values):
+        values = values.reshape(len(values))
     if values.dtype != np.bool_ and not (values.dtype.kind in "iuf" and np.isin(values, (0, 1)).all()):
         raise ValueError(f"`{name}` must be True or False (or 1 or 0) in each row, but has values of {values.dtype}.")
     return values.astype(bool)

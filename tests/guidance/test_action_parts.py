@@ -16,6 +16,7 @@ from sb3_sap import (
     PermissibilityPredictor,
     check_permissibility,
 )
+from sb3_sap.cli.main import main
 from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.evaluation.predictor_plots import permissible_probability, plot_permissibility
 from sb3_sap.guidance.auxiliary_loss import rejection
@@ -58,6 +59,11 @@ class Grid(Plane):
 
 def does_not_grow(obs, actions, next_obs):
     return np.abs(next_obs) <= np.abs(obs)
+
+
+def saved(model, folder):
+    model.save(folder / "saved")
+    return folder / "saved"
 
 
 def of_the_info(**settings):
@@ -135,6 +141,28 @@ def test_rejected_part_alone_is_replaced(monkeypatch):
     plain = model.predict(np.zeros((1, 2), np.float32))[0]
     assert repaired[0, 1] == plain[0, 1]
     assert repaired[0, 0] < 0.2
+
+
+def test_part_that_was_never_fitted_is_not_asked(monkeypatch):
+    model = of_the_info(alpha=1.0, alpha_low=1.0).learn(40)
+    model.predictor.accuracies[:] = th.tensor([0.5, th.nan])
+    verdicts(monkeypatch, model, lambda a: th.stack([th.ones(len(a)), 0.2 - a[:, 1]], dim=1))
+    rejected = np.array([[0.9, 0.4]], dtype=np.float32)
+    assert model.guide(rejected) is None
+    obs = np.zeros((1, 2), np.float32)
+    np.testing.assert_array_equal(model.predict(obs, guided=True)[0], model.predict(obs)[0])
+
+
+def test_known_actions_hold_beside_parts(monkeypatch):
+    model = of_the_info(permissible_actions=lambda obs, actions: actions.sum(axis=1) < -1).learn(40)
+    model.predictor.n_updates += 1  # as if it were fitted
+    model.predictor.accuracies[:] = th.nan
+    assert model.predict(np.zeros((5, 2), np.float32), guided=True)[0].sum(axis=1).max() < -1
+    model.predictor.accuracies[:] = 1.0
+    verdicts(monkeypatch, model, lambda a: th.stack([a[:, 0], th.ones(len(a))], dim=1))
+    [guided] = model.predict(np.zeros((1, 2), np.float32), guided=True)[0]
+    assert guided[0] > 0
+    assert guided.sum() < -1
 
 
 def test_second_part_is_judged_beside_the_repaired_first(monkeypatch):
@@ -245,8 +273,24 @@ def test_predictor_alone_is_saved_with_its_parts(tmp_path):
     assert loaded.parts.as_dict() == PARTS
     other = of_the_info(predictor=tmp_path / "predictor.pt")
     np.testing.assert_array_equal(other.predictor.accuracies, model.predictor.accuracies)
-    with pytest.raises(ValueError, match="action_parts"):
-        DDPGAP("MlpPolicy", Plane(), predictor=tmp_path / "predictor.pt", action_parts={"z": [0, 1]})
+    for parts in ({"z": [0, 1]}, None):
+        with pytest.raises(ValueError, match="The AP predictor has the `action_parts`"):
+            DDPGAP("MlpPolicy", Plane(), predictor=tmp_path / "predictor.pt", action_parts=parts)
+    again = DDPGAP.load(saved(other, tmp_path), env=Plane())
+    assert again.predictor.parts.as_dict() == PARTS
+
+
+def test_commands_know_parts(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sb3_sap.cli.predictor.make_env", lambda *_: Plane())
+    rng = np.random.default_rng(0)
+    obs, actions = rng.uniform(-1, 1, (400, 2)), rng.uniform(-1, 1, (400, 2)) * [1, 3]
+    np.savez(tmp_path / "log.npz", obs=obs, actions=actions, next_obs=obs + 0.2 * actions / [1, 3])
+    log, out = str(tmp_path / "log.npz"), str(tmp_path / "predictor.pt")
+    named = ["--env", "Plane", "--ap-function", f"{__name__}.does_not_grow", "--action-parts", "{x: [0], y: [1]}"]
+    assert main(["predictor", "fit", log, *named, "--out", out, "--net-arch", "32"]) == 0
+    assert main(["predictor", "evaluate", out, log, *named]) == 0
+    assert main(["predictor", "show", out]) == 0
+    assert "of y" in capsys.readouterr().out
 
 
 def test_transitions_of_elsewhere_have_labels_of_parts():

@@ -44,7 +44,8 @@ def test_late_penalty_is_in_units_of_normalised_rewards():
     plain = build_on_policy(PPOAP, VecNormalize(envs(THIRD)), **settings).learn(16)
     model = build_on_policy(PPOAP, env, **settings, penalty=1.0).learn(16)
     added = (model.rollout_buffer.rewards - plain.rollout_buffer.rewards).ravel()
-    assert [i for i, x in enumerate(added) if x < 0] == [1, 2, 3, 9, 10, 11]
+    # The rewards of the others may differ by rounding.
+    assert [i for i, x in enumerate(added) if x < -1e-3] == [1, 2, 3, 9, 10, 11]
     assert labels_of(model) == expected([THIRD], 16, 2, "cost")
     assert added.min() == pytest.approx(added[1], rel=0.5)
 

@@ -55,7 +55,7 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     )
     reference = reference_share(results, scores)
     shares = EARLY_SHARES if kind == "starts" else SHARES
-    rows = [_row(results, scores, name, reference, shares) for name in results.names]
+    rows = [_row(results, scores, name, reference, shares, kind) for name in results.names]
     improvements = improvement(results, scores, kind)
     if not improvements.empty:
         write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
@@ -129,8 +129,19 @@ def _at(scores: pd.DataFrame, name: str, share: float) -> FloatArray:
     return values
 
 
+def _laps_after(laps: pd.DataFrame, last: int) -> dict[str, str]:
+    """How many runs do every lap, and the S of the worst lap, after half of the training and at its end."""
+    row = {}
+    for checkpoint in (last // 2, last):
+        own = laps[laps["checkpoint"] == checkpoint]
+        done = own.groupby("seed")["lap_done"].all().astype(bool)
+        row[f"laps done after {checkpoint:,}"] = f"{done.sum()} of {len(done)} runs"
+        row[f"worst lap after {checkpoint:,}"] = f"{own['score'].min():.3f}"
+    return row
+
+
 def _row(
-    results: Results, scores: pd.DataFrame, name: str, reference: float, shares: tuple[float, ...]
+    results: Results, scores: pd.DataFrame, name: str, reference: float, shares: tuple[float, ...], kind: str
 ) -> dict[str, str]:
     own = scores[scores["configuration"] == name]
     last = own["checkpoint"].max()
@@ -148,6 +159,8 @@ def _row(
     if results.simulator in ENVIRONMENTS:
         laps = results.final_laps().query("configuration == @name", local_dict={"name": name})
         all_done = laps.groupby("seed")["lap_done"].all()
+        if kind == "failing":
+            row |= _laps_after(results.laps.query("configuration == @name", local_dict={"name": name}), last)
         row["runs that fail"] = f"{(~all_done.astype(bool)).sum()} of {len(all_done)}"
         reached = steps_to_competence(results.laps[results.laps["configuration"] == name], GOOD)
     else:

@@ -9,6 +9,7 @@ from sb3_sap.benchmark.recovery import SACRecovery
 SETTINGS = {"ap_function": towards_centre, "learning_starts": 100, "batch_size": 32}
 
 
+@pytest.mark.slow
 def test_safety_critic_learns_which_actions_are_mistakes():
     model = build(SACRecovery, Line(labels=False), risk_gamma=0.0, **SETTINGS).learn(400)
     obs = th.tensor([[0.4, 0.5], [0.4, 0.5], [-0.4, 0.5], [-0.4, 0.5]])

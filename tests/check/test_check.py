@@ -117,6 +117,7 @@ def test_uninformative_dimensions_are_named():
     assert any("from action[0] and action[2]." in sentence for sentence in report.advice)
 
 
+@pytest.mark.slow
 def test_accuracy_without_the_action_shows_whether_the_state_decides():
     decided_by_action = check(FixedLine(0.5), steps_left, n_steps=1_000)
     assert decided_by_action.accuracy_without_action == pytest.approx(0.5, abs=0.08)

@@ -94,6 +94,7 @@ def test_help_prints_the_usage(command, capsys):
     assert "usage: sb3-sap" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_loadable_model(tmp_path):
     command = [sys.executable, "-m", "sb3_sap.cli.main", "demo", "--steps", "100000", "--out", str(tmp_path)]
     for name in EXTRAS:  # files of another model

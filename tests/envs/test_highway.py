@@ -198,6 +198,7 @@ def test_environments_in_subprocesses_give_the_same_observations() -> None:
         workers.close()
 
 
+@pytest.mark.slow
 def test_importing_the_environments_loads_no_simulator() -> None:
     code = "import sys, sb3_sap.envs; sys.exit(any(name in sys.modules for name in ('highway_env', 'pygame')))"
     subprocess.run([sys.executable, "-c", code], check=True)

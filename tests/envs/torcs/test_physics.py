@@ -114,6 +114,7 @@ def test_cars_of_every_red_line_shift_gears(torcs):
         simulator.close()
 
 
+@pytest.mark.slow
 def test_physics_that_outlives_its_module_ends_without_an_error(torcs):
     code = (
         "import os\n"

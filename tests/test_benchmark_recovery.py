@@ -1,6 +1,7 @@
 """The rival with a safety critic: what it learns, and when it acts."""
 
 import numpy as np
+import pytest
 import torch as th
 from toy import Line, build, towards_centre
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -17,6 +18,9 @@ from sb3_sap.predictor.reports import PredictorReport
 #: Maximum number of held-out examples on which E is measured.
 MEASURED = 2_000
 
+#: Minimum number of mini-batches between two measurements: the loss of a new network stands still for some hundred.
+UPDATES = 200
+
 
 def fit_until_best(
     predictor: PermissibilityPredictor,
@@ -28,6 +32,8 @@ def fit_until_best(
 ) -> PredictorReport:
     """Passes over the training part, after each of which E is measured on the validation part.
 
+    Where a pass has fewer than ``UPDATES`` mini-batches, as many passes as are needed count as one.
+
     :param source: labelled actions, with both classes in both parts
     :param dataset_size: N_E, examples of each fit
     :param passes: their numbers, from 1
@@ -36,7 +42,8 @@ def fit_until_best(
         they are better
     """
     held_out = source.sample_own(min(MEASURED, 2 * min(source.counts("validation"))), "validation", normalize)
-    fits = max(1, round(sum(source.counts("train")) / dataset_size))
+    enough = math.ceil(UPDATES / math.ceil(dataset_size / predictor.batch_size))
+    fits = max(enough, round(sum(source.counts("train")) / dataset_size))
     best = measure(predictor, held_out) if predictor.fitted else None
     weights, since = copy.deepcopy(predictor.state_dict()), 0
     for number in passes:

@@ -166,7 +166,7 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
 
         Afterwards E is trusted as far as its accuracy goes, so that ``t_k`` and ``learning_starts`` may be 0.
 
-        :param epochs: maximum number of passes over the training examples
+        :param epochs: maximum number of passes over the training examples, each of at least 200 mini-batches
         :param patience: passes without a lower held-out loss after which it ends; the best weights are kept
         :return: balanced accuracy and calibration on held-out examples
         :raise ValueError: if there are too few labelled actions of both classes

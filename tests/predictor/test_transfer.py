@@ -290,6 +290,16 @@ def test_predictor_is_fitted_before_the_first_step_and_trusted():
     assert len(env.executed) == 20
 
 
+@pytest.mark.parametrize("batch_size", [16, 64])
+def test_few_examples_are_fitted_beyond_the_plateau_at_the_start(batch_size):
+    log = line_log(150)
+    for name in ("obs", "next_obs"):
+        log[name] = np.float32(0.05) * log[name]  # so near the middle, towards or away depends on small differences
+    log["labels"] = (log["actions"] * log["obs"][:, :1] < 0)[:, 0]
+    model, _ = known(log=log, predictor_kwargs={"net_arch": [64, 64], "batch_size": batch_size}, dataset_size=256)
+    assert model.fit_predictor(epochs=20).accuracy > 0.8
+
+
 def test_fit_keeps_the_best_weights(monkeypatch):
     model, _ = known()
     first = model.fit_predictor(epochs=5)

@@ -9,14 +9,16 @@ import numpy as np
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.algorithms import DDPGAP, SACAP
+from sb3_sap.benchmark.cloning import clone
 from sb3_sap.benchmark.linear import GAINS, LinearFeedback
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.presets import preset
 from sb3_sap.transitions.batch import Transitions
+from sb3_sap.transitions.sources import batches_of, joined
 
 #: What a run begins with: nothing; the predictor of the source, its policy, or both; its transitions with their
-#: rewards; a policy that imitates all of its actions, or those that are permissible, each beside its transitions.
+#: rewards; a policy that imitates all of its actions, or is taught what is permissible, each beside its transitions.
 STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "taught")
 #: Where it comes from: an agent on the embedded simulator; on the simulator of the run itself a linear controller with
 #: noise, the same with one label in ten wrong, the same without steps left of the centre line, or random actions.
@@ -72,9 +74,8 @@ class StartedMixin:
             self.policy.load_state_dict(donor.policy.state_dict())
         if self.start == "cloned":
             self.add_knowledge(transitions, into="replay")
-            self.add_knowledge(_all_permissible(transitions), into="knowledge")
-            self.teach_policy(hold=HOLD)
-            self.forget_knowledge()
+            clone(self, joined(list(batches_of(transitions))))
+            self.held_until = HOLD
             return
         if self.start in ("replay", "taught"):
             self.add_knowledge(transitions, into="replay" if self.start == "replay" else "both")
@@ -83,10 +84,10 @@ class StartedMixin:
         if self.start == "taught" or (donor is None and self.start == "predictor"):
             self.fit_predictor()
         elif "predictor" in self.start:
-            donor.predictor.about = {"accuracy": donor.validation_accuracy}
+            donor.fit_predictor()
             self.predictor_kwargs: Any = {}
             self.set_predictor(donor.predictor)
-        if self.start == "taught":
+        if self.start in ("taught", "predictor"):
             self.teach_policy(hold=HOLD)
 
 
@@ -116,13 +117,6 @@ def log(kind: str, simulator: str, seed: int) -> Transitions:
     if kind == "wrong":
         return replace(made, labels=np.logical_xor(columns[-1], rng.random(len(made)) < 0.1))
     return made.rows(np.asarray(made.obs)[:, 1] <= 0) if kind == "region" else made
-
-
-def _all_permissible(source: Any) -> Any:
-    from sb3_sap.transitions.sources import batches_of, joined
-
-    arrays = joined(list(batches_of(source))).arrays()
-    return arrays | {"labels": np.ones(len(arrays["actions"]), dtype=bool)}
 
 
 class DDPGAPStarted(StartedMixin, DDPGAP):  # type: ignore[misc]

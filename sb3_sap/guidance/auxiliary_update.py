@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Real
 from typing import Any, cast
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
-from sb3_sap.guidance.auxiliary_loss import cloning_step, permissible_actor_step, permissible_value_step
-from sb3_sap.predictor.knowledge import PERMISSIBLE
+from sb3_sap.guidance.auxiliary_loss import permissible_actor_step, permissible_value_step, taught_step
 from sb3_sap.predictor.schedule import check_growth, due
 
 #: After guidance ends, refit the predictor only every n-th time.
@@ -115,36 +114,27 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         return step(self if self.discrete else self.actor, self.predictor, observations, coef)
 
     def teach_policy(self, steps: int = 1_000, hold: int = 0) -> float:
-        """Teaches the policy what is permissible, before the first step, from the actions that are known.
+        """Teaches the policy what E permits, before the first step.
 
-        These are what :meth:`add_knowledge` kept, or else K. A continuous actor regresses on those that are labelled
-        permissible; the values of discrete actions learn to prefer what E permits
-        (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`). Target networks follow.
+        A continuous actor learns the actions that E permits (:func:`~sb3_sap.guidance.auxiliary_loss.taught_step`), and
+        the values of discrete actions learn to prefer them
+        (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`), in the states of :meth:`add_knowledge`, or else of
+        K, or else in those that came with the predictor. Target networks follow.
 
         :param steps: gradient steps
         :param hold: timesteps from now on for which a continuous actor stays as it was taught, while the critics learn
             what its actions are worth: at first they would lead it astray
         :return: the mean loss of the last tenth of them
-        :raise ValueError: if no permissible action is known, or for discrete actions if E was not fitted
+        :raise ValueError: if no state is known, or E was not fitted
         """
         if steps < 1:
             raise ValueError(f"`steps` must be at least 1, but is {steps!r}.")
-        source = self.knowledge.prior or self.knowledge
-        self._begin_statistics(source)
-        if source.counts("train")[PERMISSIBLE] == 0 or (self.discrete and not self.predictor.fitted):
-            missing = "E is not fitted: call `fit_predictor` first" if len(source) else "nothing is known"
-            raise ValueError(f"The policy cannot be taught, because {missing}.")
-        losses, normalize = [], self.get_vec_normalize_env()
-        for _ in range(steps):
+        losses = []
+        for observations in itertools.islice(self.known_states(self.predictor.batch_size), steps):
             if self.discrete:
-                sample = source.sample_own(self.predictor.batch_size, "train", normalize, balanced=False)
+                losses.append(self._permissible_step(observations, 1.0))
             else:
-                sample = source.sample_class(PERMISSIBLE, self.predictor.batch_size, "train", normalize)
-            obs: Any = obs_as_tensor(cast(Any, sample.observations), self.device)
-            if self.discrete:
-                losses.append(self._permissible_step(obs, 1.0))
-            else:
-                losses.append(cloning_step(self.actor, obs, th.as_tensor(sample.actions, device=self.device)))
+                losses.append(taught_step(self.actor, self.predictor, observations))
         for own, target in TARGETS:
             if getattr(self, own, None) is not None and getattr(self, target, None) is not None:
                 getattr(self, target).load_state_dict(getattr(self, own).state_dict())

@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_sap.common.arrays import BoolArray, rows_of
 from sb3_sap.common.errors import is_number
@@ -25,6 +26,7 @@ from sb3_sap.predictor.learned import LearnedPredictorMixin
 from sb3_sap.predictor.measuring import Familiarity
 from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.reports import KnowledgeReport, PredictorReport
+from sb3_sap.predictor.states import random_rows, some_states
 from sb3_sap.predictor.weights import check_same_spaces, check_statistics, statistics_of
 from sb3_sap.transitions.batch import Transitions, fitting
 from sb3_sap.transitions.sources import batches_of
@@ -103,9 +105,15 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         self.predictor.save(path)
 
     def describe_predictor(self) -> None:
-        """Notes with E how accurate it is, and how its observations were normalised."""
+        """Notes with E how accurate it is, in which states, and how its observations were normalised."""
         statistics = statistics_of(self.get_vec_normalize_env())
-        self.predictor.about = {"accuracy": float(self.validation_accuracy), "statistics": statistics}
+        source = self.knowledge if len(self.knowledge) or self.knowledge.prior is None else self.knowledge.prior
+        states = some_states(source) or self.predictor.about.get("states")
+        self.predictor.about = {
+            "accuracy": float(self.validation_accuracy),
+            "statistics": statistics,
+            "states": states,
+        }
 
     def add_knowledge(
         self, source: Any, into: Into | None = None, columns: Columns | None = None, progress_bar: bool = False
@@ -192,6 +200,26 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
         self.describe_predictor()
         self._expect_familiarity()
         return report
+
+    def known_states(self, n: int) -> Iterator[Any]:
+        """Batches of n observation tensors, without end, of states that E has learned in.
+
+        :raise ValueError: if there are none, or E was not fitted
+        """
+        source = self.knowledge.prior or self.knowledge
+        states = None if sum(source.counts("train")) else self.predictor.about.get("states")
+        if not (self.predictor.fitted and (states or sum(source.counts("train")))):
+            missing = "E is not fitted: call `fit_predictor` first" if len(source) else "nothing is known"
+            raise ValueError(f"The policy cannot be taught, because {missing}.")
+        self._begin_statistics(source)
+        normalize = self.get_vec_normalize_env()
+        while True:
+            if states is None:
+                obs = source.sample_own(n, "train", normalize, balanced=False).observations
+            else:
+                obs = random_rows(states, n, source.rng)
+                obs = obs if normalize is None else normalize.normalize_obs(obs)
+            yield obs_as_tensor(cast(Any, obs), self.device)
 
     # ---------------------------------------------------------------- an E that does not fit
 

@@ -17,9 +17,11 @@ from sb3_sap.presets import preset
 from sb3_sap.transitions.batch import Transitions
 from sb3_sap.transitions.sources import batches_of, joined
 
-#: What a run begins with: nothing; the predictor of the source, its policy, or both; its transitions with their
-#: rewards; a policy that imitates all of its actions, or is taught what is permissible, each beside its transitions.
+#: What a run begins with: nothing; the predictor of the source, which teaches the policy; its policy, or both; its
+#: transitions with their rewards; beside those a policy that imitates all of its actions, or that E has taught.
 STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "taught")
+#: Those that teach the policy what E permits.
+TAUGHT = ("predictor", "taught")
 #: Where it comes from: an agent on the embedded simulator; on the simulator of the run itself a linear controller with
 #: noise, the same with one label in ten wrong, the same without steps left of the centre line, or random actions.
 SOURCES = ("embedded", "log", "wrong", "region", "random")
@@ -52,8 +54,8 @@ class StartedMixin:
         self.start, self.source, self.source_simulator = start, source, source_simulator
         if start != "nothing":
             kwargs |= {"learning_starts": 0, "t_k": 0}
-        if start == "predictor":  # which judges the actions of a policy that knows nothing
-            kwargs |= {"alpha": 1.0, "alpha_low": 1.0, "candidate_selection": "nearest", "guidance_end": 300}
+        if start in TAUGHT:  # critics that have seen one policy alone would lead it astray once the loss has faded
+            kwargs |= {"permissibility_coef": 1.0}
         super().__init__(*args, ap_function="sb3_sap.envs.ap_function", **kwargs)  # type: ignore[call-arg]
 
     def learn(self, total_timesteps: int = 1_000, callback: MaybeCallback = None, **kwargs: Any) -> Self:
@@ -87,7 +89,7 @@ class StartedMixin:
             donor.fit_predictor()
             self.predictor_kwargs: Any = {}
             self.set_predictor(donor.predictor)
-        if self.start in ("taught", "predictor"):
+        if self.start in TAUGHT:
             self.teach_policy(hold=HOLD)
 
 

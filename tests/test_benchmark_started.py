@@ -30,6 +30,7 @@ def same(one, other):
 @pytest.mark.slow
 def test_starts_from_an_agent():
     donor = started.agent(started.DDPGAP, 100)
+    donor.fit_predictor()
     prepared = {start: model(start) for start in ("predictor", "policy", "policy_predictor", "replay")}
     for one in prepared.values():
         one._prepare()

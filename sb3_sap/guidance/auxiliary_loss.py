@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch as th
@@ -11,9 +10,6 @@ from torch.nn import functional as F
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.values import action_values
 from sb3_sap.predictor.network import PermissibilityPredictor
-
-#: Standard deviation, before the squashing, of the actions of a stochastic actor that E has taught.
-SPREAD = 0.3
 
 
 @flush_denormals()
@@ -55,30 +51,6 @@ def rejection(predictor: PermissibilityPredictor, observations: Any, actions: th
         logits = predictor.part_logits(features, th.where(own, actions, actions.detach()))[:, number]
         total = total + F.softplus(-logits).mean()
     return total
-
-
-@flush_denormals()
-def taught_step(actor: Any, predictor: PermissibilityPredictor, observations: Any) -> float:
-    """One gradient step of the actor on softplus(−E(s, μ(s))) + |μ(s)|², scaled, which has an optimum of its own.
-
-    The cross-entropy alone never ends: it drives an actor that has nothing else to follow to the bounds of the action
-    space, where E is most certain. The second term lets it move from the middle no further than E demands. A
-    stochastic actor also learns to vary its actions by `SPREAD` instead of exploring as if it knew nothing.
-
-    :param actor: with its ``optimizer``
-    :param observations: n observation tensors
-    :return: the loss before the step
-    """
-    actions = mean_action(actor, observations)
-    loss = rejection(predictor, observations, actions) + (actions**2).sum(dim=1).mean()
-    if hasattr(actor, "action_log_prob"):
-        _, log_std, _ = actor.get_action_dist_params(observations)
-        loss = loss + ((log_std - math.log(SPREAD)) ** 2).mean()
-    actor.optimizer.zero_grad()
-    trained = [parameter for parameter in actor.parameters() if parameter.requires_grad]
-    loss.backward(inputs=trained)  # type: ignore[no-untyped-call]
-    actor.optimizer.step()
-    return float(loss.item())
 
 
 def mean_action(actor: Any, observations: Any) -> th.Tensor:

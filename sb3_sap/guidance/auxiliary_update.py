@@ -16,7 +16,8 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
-from sb3_sap.guidance.auxiliary_loss import permissible_actor_step, permissible_value_step, taught_step
+from sb3_sap.guidance.auxiliary_loss import permissible_actor_step, permissible_value_step
+from sb3_sap.guidance.teaching import cloning_step, taught_step
 from sb3_sap.predictor.schedule import check_growth, due
 
 #: After guidance ends, refit the predictor only every n-th time.
@@ -113,28 +114,35 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         step = permissible_value_step if self.discrete else permissible_actor_step
         return step(self if self.discrete else self.actor, self.predictor, observations, coef)
 
-    def teach_policy(self, steps: int = 1_000, hold: int = 0) -> float:
-        """Teaches the policy what E permits, before the first step.
+    def teach_policy(self, steps: int = 1_000, hold: int = 0, imitate: bool = False) -> float:
+        """Teaches the policy what is permissible, before the first step.
 
-        A continuous actor learns the actions that E permits (:func:`~sb3_sap.guidance.auxiliary_loss.taught_step`), and
-        the values of discrete actions learn to prefer them
-        (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`), in the states of :meth:`add_knowledge`, or else of
-        K, or else in those that came with the predictor. Target networks follow.
+        A continuous actor moves to what E permits, no further than it demands
+        (:func:`~sb3_sap.guidance.teaching.taught_step`), and the values of discrete actions learn to prefer what E
+        permits (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`), in the states of :meth:`add_knowledge`, or
+        else of K, or else in those that came with the predictor. Target networks follow.
 
         :param steps: gradient steps
         :param hold: timesteps from now on for which a continuous actor stays as it was taught, while the critics learn
             what its actions are worth: at first they would lead it astray
+        :param imitate: whether a continuous actor imitates the permissible actions of the log instead. That is better
+            where somebody drove well and the label permits much else
         :return: the mean loss of the last tenth of them
-        :raise ValueError: if no state is known, or E was not fitted
+        :raise ValueError: if no state is known, or E was not fitted; to imitate, if no permissible action is known
         """
         if steps < 1:
             raise ValueError(f"`steps` must be at least 1, but is {steps!r}.")
-        losses = []
-        for observations in itertools.islice(self.known_states(self.predictor.batch_size), steps):
-            if self.discrete:
-                losses.append(self._permissible_step(observations, 1.0))
+        if imitate and self.discrete:
+            raise ValueError("`imitate` needs continuous actions: leave it out.")
+        losses, n = [], self.predictor.batch_size
+        lessons: Any = self.known_actions(n) if imitate else self.known_states(n)
+        for lesson in itertools.islice(lessons, steps):
+            if imitate:
+                losses.append(cloning_step(self.actor, *lesson))
+            elif self.discrete:
+                losses.append(self._permissible_step(lesson, 1.0))
             else:
-                losses.append(taught_step(self.actor, self.predictor, observations))
+                losses.append(taught_step(self.actor, self.predictor, lesson))
         for own, target in TARGETS:
             if getattr(self, own, None) is not None and getattr(self, target, None) is not None:
                 getattr(self, target).load_state_dict(getattr(self, own).state_dict())

@@ -20,7 +20,7 @@ from sb3_sap.common.vec_envs import environment_layout, never_updated
 from sb3_sap.permissibility import query_labels
 from sb3_sap.predictor.building import make_knowledge, make_predictor
 from sb3_sap.predictor.fitting import fit_until_best, with_progress
-from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.knowledge import PERMISSIBLE, KnowledgeBuffer
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.learned import LearnedPredictorMixin
 from sb3_sap.predictor.measuring import Familiarity
@@ -220,6 +220,19 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                 obs = random_rows(states, n, source.rng)
                 obs = obs if normalize is None else normalize.normalize_obs(obs)
             yield obs_as_tensor(cast(Any, obs), self.device)
+
+    def known_actions(self, n: int) -> Iterator[tuple[Any, th.Tensor]]:
+        """Batches of n observation tensors and (n, action_dim) scaled permissible actions of the log or K.
+
+        :raise ValueError: if there are none
+        """
+        source = self.knowledge.prior or self.knowledge
+        if source.counts("train")[PERMISSIBLE] == 0:
+            raise ValueError("The policy cannot imitate, because no permissible action is known: use `add_knowledge`.")
+        self._begin_statistics(source)
+        while True:
+            obs, actions, _ = source.sample_class(PERMISSIBLE, n, "train", self.get_vec_normalize_env())
+            yield obs_as_tensor(cast(Any, obs), self.device), th.as_tensor(actions, device=self.device)
 
     # ---------------------------------------------------------------- an E that does not fit
 

@@ -15,7 +15,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import DISCRETE, GUIDED, Line, build, towards_centre
 
 from sb3_sap import A2CAP, DDPGAP, DQNAP, PPOAP, SACAP, LearnedPermissibility, PermissibilityPredictor
-from sb3_sap.guidance.auxiliary_loss import SPREAD
+from sb3_sap.guidance.teaching import SPREAD
 from sb3_sap.transitions.sources import batches_of, joined
 
 WIDE = {
@@ -394,6 +394,18 @@ def test_predictor_alone_teaches_a_policy(algorithm, kind, tmp_path):
     assert towards[0] > 0 > towards[1]
 
 
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP])
+def test_policy_imitates_the_permissible_actions_of_a_log(algorithm):
+    rng, log = np.random.default_rng(0), line_log()
+    log["labels"] = rng.random(2_000) < 0.5
+    log["actions"] = np.where(log["labels"][:, None], rng.normal(-0.6, 0.05, (2_000, 1)), 0.6).astype(np.float32)
+    model, _ = known(algorithm, log=log, policy_kwargs={"net_arch": [32]}, learning_rate=0.01)
+    model.teach_policy(600, imitate=True)
+    drawn = model.predict(np.tile(np.array([[0.5, 0.5]], np.float32), (500, 1)))[0]
+    assert drawn.mean() == pytest.approx(-0.6, abs=0.1)
+    assert drawn.std() == pytest.approx(0.05 if algorithm is SACAP else 0, abs=0.06)
+
+
 def test_actor_that_was_not_taught_or_is_not_held_learns_before_the_first_step():
     model, _ = known()
     model.add_knowledge(line_log(100), into="replay")
@@ -424,6 +436,10 @@ def test_policy_cannot_be_taught_by_nothing():
         build(DDPGAP).teach_policy()
     with pytest.raises(ValueError, match="call `fit_predictor` first"):
         known()[0].teach_policy()
+    with pytest.raises(ValueError, match="no permissible action is known"):
+        build(DDPGAP).teach_policy(imitate=True)
+    with pytest.raises(ValueError, match="needs continuous actions"):
+        build(DQNAP).teach_policy(imitate=True)
 
 
 def test_frozen_predictor_stays_as_it_is():

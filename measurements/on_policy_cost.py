@@ -28,7 +28,8 @@ from step_cost import seconds, timed
 from sb3_sap import PPOAP, preset
 from sb3_sap.benchmark.provenance import provenance
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_text
-from sb3_sap.onpolicy.guide import Guide
+from sb3_sap.onpolicy.draws import DrawingGuide
+from sb3_sap.onpolicy.enumerated import EnumeratedGuide
 from sb3_sap.onpolicy.labels import LabelCallback
 from sb3_sap.onpolicy.loss import PermissibilityLoss
 from sb3_sap.predictor.callbacks import PermissibilityCallback
@@ -112,9 +113,9 @@ def watch_the_parts() -> None:
         (LabelCallback, "_on_step", "labels"),
         (PermissibilityCallback, "fit", "fit E"),
         (PermissibilityCallback, "validate", "validate E"),
-        (Guide, "distribution", "guide"),
-        (Guide, "first_permissible", "guide"),
-        (Guide, "log_prob", "guide"),
+        (EnumeratedGuide, "distribution", "guide"),
+        (DrawingGuide, "first_permissible", "guide"),
+        (DrawingGuide, "log_prob", "guide"),
         (PermissibilityLoss, "added_to", "loss"),
     )
     for cls, method, name in watched:

@@ -20,6 +20,7 @@ class Bounds:
         assert isinstance(space, spaces.Box)
         self.squashed = squashed
         self._low, self._high = (th.as_tensor(bound.reshape(-1), device=device) for bound in (space.low, space.high))
+        self._scaled = bool((space.low == -1).all() and (space.high == 1).all())
 
     def executed(self, actions: th.Tensor, straight: bool = False) -> th.Tensor:
         """(n, action_dim) what is executed of a policy's actions, scaled to [-1, 1].
@@ -29,8 +30,10 @@ class Bounds:
         """
         if self.squashed:
             return actions
-        low, high = self._low.to(actions.dtype), self._high.to(actions.dtype)
-        scaled = 2 * (actions - low) / (high - low) - 1
+        scaled = actions
+        if not self._scaled:
+            low, high = self._low.to(actions.dtype), self._high.to(actions.dtype)
+            scaled = 2 * (actions - low) / (high - low) - 1
         clipped = scaled.clamp(-1, 1)
         return scaled + (clipped - scaled).detach() if straight else clipped
 

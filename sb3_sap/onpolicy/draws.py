@@ -34,15 +34,15 @@ class DrawingGuide(Guide):
         self.n_candidates = n_candidates
         self.bounds = Bounds(self.space, squashed, self.device)
         self._generator = th.Generator(self.device).manual_seed(seed)
-        #: Draws in each state of the rollout of which E permits some and rejects some: those before they are squashed,
-        #: their log-densities, and E's verdicts.
+        #: The draws in each state of the rollout: those before they are squashed, their log-densities, E's verdicts.
         self._drawn = Remembered()
 
     def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
         # The object is the policy's own, and used again.
         guided = copy.copy(distribution)
-        guided.get_actions = partial(self.first_permissible, obs, distribution)  # type: ignore[method-assign]
-        guided.log_prob = partial(self.log_prob, obs, distribution)  # type: ignore[method-assign]
+        shares: list[th.Tensor] = []
+        guided.get_actions = partial(self.first_permissible, obs, distribution, shares)  # type: ignore[method-assign]
+        guided.log_prob = partial(self.log_prob, obs, distribution, shares)  # type: ignore[method-assign]
         return guided
 
     def losses(self, obs: Any, distribution: Distribution) -> th.Tensor:
@@ -53,46 +53,56 @@ class DrawingGuide(Guide):
 
     @th.no_grad()
     @flush_denormals()
-    def first_permissible(self, obs: Any, distribution: Distribution, deterministic: bool = False) -> th.Tensor:
+    def first_permissible(
+        self, obs: Any, distribution: Distribution, shares: list[th.Tensor] | None = None, deterministic: bool = False
+    ) -> th.Tensor:
         """(n, action_dim). The first draw is the policy's own; the others are drawn in one call.
 
+        :param shares: gets (n,) log Z, if all states are met for the first time
         :param deterministic: the mode, or the candidate nearest to it among stratified ones of a fixed seed
         """
         assert self.predictor is not None
         proposed = distribution.get_actions(deterministic=deterministic)
         features = self.predictor.features(obs)
         if deterministic or self.n_candidates == 1:
-            permitted = self._permits(features, proposed[:, None])
             candidates = proposed[:, None]
+            permitted = self._permits(features, candidates)
             if self.n_candidates > 1 and not permitted.all():
                 candidates = th.cat([candidates, self._around(proposed)], dim=1)
                 permitted = self._permits(features, candidates)
         else:
             # In all states, because the share of them that is permitted says how dense the executed action is.
-            plain = self._draws(distribution)
+            plain, density = self._draws(distribution)
             bijector = getattr(distribution, "bijector", None)
             drawn = plain if bijector is None else bijector.forward(plain)
             candidates = th.cat([proposed[:, None], drawn], dim=1)
             permitted = self._permits(features, candidates)
             if not self.predicts:
-                self._remember(obs, distribution, plain, permitted[:, 1:])
-        rejected = ~permitted[:, 0]
-        self.record("sap/rejection_rate", rejected)
-        if rejected.any() and self.n_candidates > 1:
-            self.record("sap/fallback_rate", ~permitted[rejected].any(dim=1))
-        # Where none is permitted, the first.
-        return candidates[th.arange(len(candidates), device=self.device), permitted.int().argmax(dim=1)]
+                self._remember(obs, plain, density, permitted[:, 1:], shares)
+        first = permitted.int().argmax(dim=1)  # where none is permitted, the first
+        found, proposed_permitted = permitted.any(dim=1), permitted[:, 0]
+        self.record("sap/rejection_rate", ~proposed_permitted)
+        if self.n_candidates > 1 and not proposed_permitted.all():
+            self.record("sap/fallback_rate", ~found[~proposed_permitted])
+        return candidates[th.arange(len(first), device=self.device), first]
 
-    def _remember(self, obs: Any, distribution: Distribution, plain: th.Tensor, permitted: th.Tensor) -> None:
-        some = permitted.any(dim=1) & ~permitted.all(dim=1)
-        if not some.any():
-            return
-        density = _log_density(distribution, plain)
-        found = th.cat([plain.flatten(1), density, permitted.to(density.dtype)], dim=1)[some].cpu().numpy()
-        states = [state for state, kept in zip(keys_of(obs), some.tolist(), strict=True) if kept]
-        self._drawn.rows(states, lambda new: found[new])
+    def _remember(
+        self,
+        obs: Any,
+        plain: th.Tensor,
+        density: th.Tensor,
+        permitted: th.Tensor,
+        shares: list[th.Tensor] | None,
+    ) -> None:
+        """Keeps the draws in n states, of which those of the first time count."""
+        draws = th.cat([plain.flatten(1), density, permitted.to(density.dtype)], dim=1).cpu().numpy()
+        states = keys_of(obs)
+        new = self._drawn.add_new(states, draws)
+        if shares is not None and new:
+            share = permitted.to(density.dtype).mean(dim=1)
+            shares.append(th.where(share > 0, share, 1).log())
 
-    def log_prob(self, obs: Any, distribution: Distribution, actions: th.Tensor) -> th.Tensor:
+    def log_prob(self, obs: Any, distribution: Distribution, shares: list[th.Tensor], actions: th.Tensor) -> th.Tensor:
         """(n,) log π(a) − log Z of executed continuous actions, Z being estimated from the draws of the rollout.
 
         Z is the share of draws that E permits; in an update, where the policy has changed since they were drawn, each
@@ -100,13 +110,20 @@ class DrawingGuide(Guide):
         error of the value would draw the policy towards or away from what E permits, for the expected score of the
         executed actions is ∇ log Z, and not zero (`measurements/continuous_choice.py`). Where all draws are permitted,
         or none is, so that the executed action is the policy's own, Z is 1.
+
+        :param shares: (n,) log Z, if the draws were made from this very distribution
         """
         log_prob = distribution.log_prob(actions)
+        if shares:
+            return log_prob - shares[0]
         known, draws = self._drawn.known(keys_of(obs))
-        if not known:
+        n = self.n_candidates - 1
+        counts = draws[:, -n:].sum(axis=1) if known else np.zeros(0)
+        some = (counts > 0) & (counts < n)
+        if not some.any():
             return log_prob
-        rows, n = th.as_tensor(known, device=log_prob.device), self.n_candidates - 1
-        plain, density, permitted = th.as_tensor(draws, device=log_prob.device).tensor_split([-2 * n, -n], dim=1)
+        rows = th.as_tensor(np.asarray(known)[some], device=log_prob.device)
+        plain, density, permitted = th.as_tensor(draws[some], device=log_prob.device).tensor_split([-2 * n, -n], dim=1)
         change = _log_density(distribution, plain.reshape(len(rows), n, -1), rows) - density
         log_share = change.masked_fill(permitted < 0.5, -th.inf).logsumexp(dim=1) - math.log(n)
         return log_prob.index_add(0, rows, -log_share)
@@ -116,15 +133,16 @@ class DrawingGuide(Guide):
         assert self.predictor is not None
         m, n, dim = candidates.shape
         executed = self.bounds.executed(candidates.reshape(m * n, dim))
-        return self.predictor.logits(features.repeat_interleave(n, dim=0), executed).reshape(m, n) > 0
+        repeated = features.expand(n, -1) if m == 1 else features.repeat_interleave(n, dim=0)
+        return self.predictor.logits(repeated, executed).reshape(m, n) > 0
 
-    def _draws(self, distribution: Any) -> th.Tensor:
-        """(n, N - 1, action_dim) further draws, before they are squashed."""
+    def _draws(self, distribution: Any) -> tuple[th.Tensor, th.Tensor]:
+        """(n, N - 1, action_dim) further draws, before they are squashed, and their log-densities, (n, N - 1)."""
         # gSDE's own noise is the same at every call: this is its distribution over many.
-        normal = distribution.distribution
-        shape = (len(normal.mean), self.n_candidates - 1, normal.mean.shape[1])
-        noise = th.randn(shape, generator=self._generator, device=normal.mean.device)
-        return normal.mean[:, None] + normal.stddev[:, None] * noise  # type: ignore[no-any-return]
+        mean, deviation = distribution.distribution.mean, distribution.distribution.stddev
+        shape = (len(mean), self.n_candidates - 1, mean.shape[1])
+        noise = th.randn(shape, generator=self._generator, device=mean.device)
+        return mean[:, None] + deviation[:, None] * noise, _standard_log_density(noise, deviation)
 
     def _around(self, proposed: th.Tensor) -> th.Tensor:
         """(m, N, action_dim) candidates from the whole space, the nearest to the proposed actions first."""
@@ -138,7 +156,11 @@ class DrawingGuide(Guide):
 def _log_density(distribution: Any, plain: th.Tensor, rows: Any = slice(None)) -> th.Tensor:
     """(m, N) log-densities of (m, N, action_dim) draws, before they are squashed, in the states of ``rows``."""
     normal = distribution.distribution
-    mean, deviation = normal.mean[rows, None], normal.stddev[rows, None]
-    # As torch's Normal computes it, without its checks, which take longer.
-    densities = -((plain - mean) ** 2) / (2 * deviation**2) - deviation.log() - math.log(math.sqrt(2 * math.pi))
-    return densities.sum(dim=2)  # type: ignore[no-any-return]
+    mean, deviation = normal.mean[rows], normal.stddev[rows]
+    return _standard_log_density((plain - mean[:, None]) / deviation[:, None], deviation)
+
+
+def _standard_log_density(noise: th.Tensor, deviation: th.Tensor) -> th.Tensor:
+    """(m, N) log-densities of what (m, N, action_dim) standard normal noise draws with (m, action_dim) deviations."""
+    constant = noise.shape[2] * math.log(math.sqrt(2 * math.pi))
+    return -0.5 * noise.square().sum(dim=2) - (deviation.log().sum(dim=1, keepdim=True) + constant)

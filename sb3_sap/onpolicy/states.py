@@ -51,6 +51,13 @@ class Remembered:
         self._table[first : self._held] = found
         self._row_of.update(zip(keys, range(first, self._held), strict=True))
 
+    def add_new(self, keys: list[bytes], found: np.ndarray[Any, Any]) -> bool:
+        """Takes in the rows of those keys that are unknown. Whether all of them were, and each occurs once."""
+        new = {key: position for position, key in reversed(list(enumerate(keys))) if key not in self._row_of}
+        if new:
+            self.add(list(new), found[list(new.values())])
+        return len(new) == len(keys)
+
     def known(self, keys: list[bytes]) -> tuple[list[int], np.ndarray[Any, Any]]:
         """The positions of those keys that are known, and their rows."""
         found = [(position, self._row_of[key]) for position, key in enumerate(keys) if key in self._row_of]

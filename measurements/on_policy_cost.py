@@ -1,8 +1,9 @@
 """Measures what permissibility costs per training step of PPO: PPOAP beside PPO with the same settings.
 
 `mask` and `draws` are `alpha=1`, the masks of finite actions and the draws of continuous ones; `loss` is the preset of
-that name; `small E` has two hidden layers of 64 units instead of 128 and 256. The two models of a pair train in turn, a rollout at a time, in one process and thread, so that other work
-on the machine affects both. The parts are measured inside the guided model.
+that name; `small E` has two hidden layers of 64 units instead of 128 and 256. The two models of a pair train in turn, a
+rollout at a time, in one process and thread, so that other work on the machine affects both. The parts are measured
+inside the guided model.
 
 Processor time is measured after the first 2,048 steps, whose labels are fitted eight times as often as later ones.
 What these steps cost more than PPO's, once in a training however long it is, is in a column of its own.

@@ -61,7 +61,7 @@ class EnumeratedGuide(Guide):
             mask = np.ones((len(states), len(self.actions)), dtype=bool) if known is None else known
         else:
             mask = self._verdicts.rows(states, lambda new: self._judge(obs, new, len(states)))
-            mask = within(mask, known)
+            mask = mask if known is None else within(mask, known)
         return th.as_tensor(mask, device=self.device)
 
     def _judge(self, obs: Any, rows: list[int], n: int) -> BoolArray:

@@ -36,10 +36,13 @@ class Remembered:
 
         :param find: is called with the positions of the unknown keys, if there are any, and returns their rows
         """
-        new = [position for position, key in enumerate(keys) if key not in self._row_of]
-        if new:
+        row_of = self._row_of
+        try:  # in an update all are known
+            return self._table[[row_of[key] for key in keys]]
+        except KeyError:
+            new = [position for position, key in enumerate(keys) if key not in row_of]
             self.add([keys[position] for position in new], find(new))
-        return self._table[[self._row_of[key] for key in keys]]
+            return self._table[[row_of[key] for key in keys]]
 
     def add(self, keys: list[bytes], found: np.ndarray[Any, Any]) -> None:
         """Takes in the rows of keys that are unknown; of a key that occurs twice among them, the last."""

@@ -14,8 +14,7 @@ from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_log_probs
 from sb3_sap.onpolicy.states import Remembered, keys_of
-from sb3_sap.predictor.network import PermissibilityPredictor
-from sb3_sap.predictor.pairs import logits_of_each
+from sb3_sap.predictor.pairs import ManyActions
 
 #: Maximum number of pairs of a state and an action that E judges at once, which bounds the memory of its layers.
 PAIRS_AT_ONCE = 32_768
@@ -35,6 +34,8 @@ class EnumeratedGuide(Guide):
         #: (k, action_dim) every action.
         self.actions = th.as_tensor(actions.reshape(len(actions), -1).astype(np.int64), device=self.device)
         self._verdicts = Remembered()
+        predictor, many = self.predictor, len(self.actions) >= MANY_ACTIONS
+        self._many = ManyActions(predictor, self.actions) if predictor is not None and many else None
 
     def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
         mask = self.mask(obs)
@@ -60,15 +61,28 @@ class EnumeratedGuide(Guide):
         if self.predictor is None:
             mask = np.ones((len(states), len(self.actions)), dtype=bool) if known is None else known
         else:
-            mask = self._verdicts.rows(states, lambda new: self._judge(obs, new, len(states)))
+            mask = self._verdicts.rows(states, lambda new: self._judge(some_rows(obs, new, len(states))))
             mask = mask if known is None else within(mask, known)
         return th.as_tensor(mask, device=self.device)
 
-    def _judge(self, obs: Any, rows: list[int], n: int) -> BoolArray:
-        """E's masks of some of n states."""
+    @th.no_grad()
+    @flush_denormals()
+    def _judge(self, obs: Any) -> BoolArray:
+        """(n, k) bool, which of all actions E permits in n states; where it permits none, all."""
         assert self.predictor is not None
-        unseen = obs if len(rows) == n else rows_of(obs, rows)
-        return permitted(self.predictor, unseen, self.actions).cpu().numpy()
+        features, k = self.predictor.features(obs), len(self.actions)
+        batches = th.split(features, max(1, PAIRS_AT_ONCE // k))
+        if self._many is not None:
+            logits = self._many.logits(batches)
+        else:
+            pairs = ((batch.repeat_interleave(k, dim=0), self.actions.repeat(len(batch), 1)) for batch in batches)
+            logits = [self.predictor.logits(*pair).reshape(-1, k) for pair in pairs]
+        return within((th.cat(logits) > 0).cpu().numpy(), None)
+
+
+def some_rows(obs: Any, rows: list[int], n: int) -> Any:
+    """The observations of some of n states."""
+    return obs if len(rows) == n else rows_of(obs, rows)
 
 
 def within(mask: BoolArray, known: BoolArray | None) -> BoolArray:
@@ -80,22 +94,3 @@ def within(mask: BoolArray, known: BoolArray | None) -> BoolArray:
         return np.asarray(mask | ~mask.any(axis=1, keepdims=True))
     both = mask & known
     return np.where(both.any(axis=1, keepdims=True), both, known)
-
-
-@th.no_grad()
-@flush_denormals()
-def permitted(predictor: PermissibilityPredictor, obs: Any, actions: th.Tensor) -> th.Tensor:
-    """(n, k) bool, which of k actions E permits in n states; where it permits none, all.
-
-    :param obs: n observation tensors
-    :param actions: (k, action_dim)
-    """
-    features, k = predictor.features(obs), len(actions)
-    parts = th.split(features, max(1, PAIRS_AT_ONCE // k))
-    if k < MANY_ACTIONS:
-        pairs = ((part.repeat_interleave(k, dim=0), actions.repeat(len(part), 1)) for part in parts)
-        logits = [predictor.logits(*pair).reshape(-1, k) for pair in pairs]
-    else:
-        logits = logits_of_each(predictor, parts, actions)
-    mask = th.cat(logits) > 0
-    return mask | ~mask.any(dim=1, keepdim=True)

@@ -9,13 +9,13 @@ import torch as th
 from stable_baselines3.common.distributions import Distribution
 
 from sb3_sap.common.action_parts import ActionParts
-from sb3_sap.common.arrays import BoolArray, rows_of
+from sb3_sap.common.arrays import BoolArray
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.onpolicy.blocks import Block, MaskedProduct, permitted_share
-from sb3_sap.onpolicy.enumerated import PAIRS_AT_ONCE, within
+from sb3_sap.onpolicy.enumerated import PAIRS_AT_ONCE, some_rows, within
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.states import Remembered, keys_of
-from sb3_sap.predictor.pairs import logits_of_choices
+from sb3_sap.predictor.pairs import ManyActions
 
 
 class FactoredGuide(Guide):
@@ -31,11 +31,13 @@ class FactoredGuide(Guide):
     def __init__(self, *args: Any, parts: ActionParts, **kwargs: Any):
         super().__init__(*args, **kwargs)
         sizes = self.known.sizes
-        judged = [list(dimensions) for dimensions in parts.indices] if self.predictor is not None else []
+        judged = [] if self.predictor is None else [list(dimensions) for dimensions in parts.indices]
         of_parts = {dimension for dimensions in judged for dimension in dimensions}
         alone = [[dimension] for dimension in range(len(sizes)) if dimension not in of_parts]
         self.blocks = [Block.of(dimensions, sizes, self.device) for dimensions in judged + alone]
         self._n_judged = len(judged)
+        predictor: Any = self.predictor
+        self._many = [ManyActions(predictor, self.blocks[part].choices, part) for part in range(len(judged))]
         self._verdicts = Remembered()
         # In the order of their dimensions, as sb3-contrib's distributions are.
         self._order = sorted(range(len(self.blocks)), key=lambda number: self.blocks[number].dimensions)
@@ -64,9 +66,7 @@ class FactoredGuide(Guide):
         known = self.known.of(states)
         of_e: list[BoolArray] = [np.ones((len(states), len(block)), dtype=bool) for block in self.blocks]
         if self.predictor is not None:
-            found = self._verdicts.rows(
-                states, lambda new: self._judge(obs if len(new) == len(states) else rows_of(obs, new))
-            )
+            found = self._verdicts.rows(states, lambda new: self._judge(some_rows(obs, new, len(states))))
             ends = np.cumsum([len(block) for block in self.blocks[: self._n_judged]])
             of_e[: self._n_judged] = np.split(found, ends[:-1], axis=1)
         sizes = self.known.sizes
@@ -86,7 +86,7 @@ class FactoredGuide(Guide):
         for part, block in enumerate(self.blocks[: self._n_judged]):
             if trusted[part]:
                 batches = th.split(features, max(1, PAIRS_AT_ONCE // len(block)))
-                found.append(th.cat(logits_of_choices(self.predictor, batches, part, block.choices)) > 0)
+                found.append(th.cat(self._many[part].logits(batches)) > 0)
             else:
                 found.append(th.ones((len(features), len(block)), dtype=th.bool, device=features.device))
         return th.cat(found, dim=1).cpu().numpy()

@@ -1,4 +1,4 @@
-"""E's judgement of many finite actions in many states at once.
+"""E's judgement of the same finite actions in many states.
 
 Of the first layer, whose inputs are mostly those of a one-hot action, features and actions have their shares once: for
 many actions that is far faster than a pass for each pair. The logits differ by rounding alone.
@@ -18,57 +18,70 @@ from sb3_sap.predictor.encoding import encoded_actions
 from sb3_sap.predictor.network import PermissibilityPredictor
 
 
-def logits_of_each(
-    predictor: PermissibilityPredictor, batches: Sequence[th.Tensor], actions: th.Tensor
-) -> list[th.Tensor]:
-    """(n, k) logits of k actions in the n states of each batch.
+class ManyActions:
+    """Many actions, whose share of E's first layer is computed again only after E was fitted.
 
-    :param batches: (n, features_dim) features
-    :param actions: (k, action_dim), scaled
+    :param predictor: E
+    :param actions: (k, action_dim), scaled; with ``part`` (k, dimensions of the part)
+    :param part: the part of a ``MultiDiscrete`` or ``MultiBinary`` action that is judged by itself; ``None``: the whole
     """
-    if predictor.own_inputs is None:
-        found: Iterable[th.Tensor] = _outputs(predictor, batches, actions)
-    else:  # each part by itself, which sees its own inputs alone
-        each = [
-            [outputs[:, part] for outputs in _outputs(predictor, batches, actions, own)]
-            for part, own in enumerate(predictor.own_inputs)
-        ]
-        found = (th.stack(parts, dim=1) for parts in zip(*each, strict=True))
-    return [predictor.of_all(outputs).reshape(-1, len(actions)) for outputs in found]
 
+    def __init__(self, predictor: PermissibilityPredictor, actions: th.Tensor, part: int | None = None):
+        self.predictor, self.part, self.actions = predictor, part, actions
+        if part is not None:
+            self.actions = actions.new_zeros((len(actions), len(sizes_of(predictor.action_space))))
+            self.actions[:, list(predictor.parts.indices[part])] = actions
+        self._shares: list[
+            th.Tensor
+        ] = []  # (k, width) of the first layer, one for each output that sees its own inputs
+        self._fitted = -1
 
-def logits_of_choices(
-    predictor: PermissibilityPredictor, batches: Sequence[th.Tensor], part: int, choices: th.Tensor
-) -> list[th.Tensor]:
-    """(n, m) logits of m choices for one part of a ``MultiDiscrete`` or ``MultiBinary`` action, judged by itself.
+    def logits(self, batches: Sequence[th.Tensor]) -> list[th.Tensor]:
+        """(n, k) logits in the n states of each batch.
 
-    :param batches: (n, features_dim) features
-    :param part: its number
-    :param choices: (m, dimensions of the part)
-    """
-    assert predictor.own_inputs is not None
-    actions = choices.new_zeros((len(choices), len(sizes_of(predictor.action_space))))
-    actions[:, list(predictor.parts.indices[part])] = choices
-    outputs = _outputs(predictor, batches, actions, predictor.own_inputs[part])
-    return [found[:, part].reshape(-1, len(choices)) for found in outputs]
+        :param batches: (n, features_dim) features
+        """
+        if self._fitted != int(self.predictor.n_updates):
+            self._shares, self._fitted = self._shares_now(), int(self.predictor.n_updates)
+        found: Iterable[th.Tensor]
+        if self.part is not None:
+            found = (outputs[:, self.part] for outputs in self._outputs(batches, self._shares[0]))
+        elif self.predictor.own_inputs is None:
+            found = (self.predictor.of_all(outputs) for outputs in self._outputs(batches, self._shares[0]))
+        else:
+            each = [
+                [outputs[:, part] for outputs in self._outputs(batches, share)]
+                for part, share in enumerate(self._shares)
+            ]
+            found = (self.predictor.of_all(th.stack(parts, dim=1)) for parts in zip(*each, strict=True))
+        return [logits.reshape(-1, len(self.actions)) for logits in found]
 
+    def _shares_now(self) -> list[th.Tensor]:
+        space, own = self.predictor.action_space, self.predictor.own_inputs
+        of_actions = self._first.weight[:, -self._first_inputs :]
+        if isinstance(space, spaces.Discrete):
+            return [of_actions.t()[self.actions.flatten().long()]]
+        encoded = encoded_actions(space, self.actions).to(of_actions.dtype)
+        if own is None:
+            return [F.linear(encoded, of_actions)]
+        seen = own if self.part is None else own[self.part : self.part + 1]
+        return [F.linear(encoded * inputs, of_actions) for inputs in seen]
 
-def _outputs(
-    predictor: PermissibilityPredictor, batches: Sequence[th.Tensor], actions: th.Tensor, own: th.Tensor | None = None
-) -> Iterator[th.Tensor]:
-    """(n m, outputs) of each state of a batch with each of m actions, for one batch after the other.
+    @property
+    def _first(self) -> Any:
+        return cast(Any, self.predictor.head)[0]
 
-    :param own: the inputs of the action that are seen; ``None``: all
-    """
-    first, *others = cast(Iterable[Any], predictor.head)
-    of_features, of_actions = first.weight.tensor_split([batches[0].shape[1]], dim=1)
-    if isinstance(predictor.action_space, spaces.Discrete):
-        share = of_actions.t()[actions.flatten().long()]
-    else:
-        encoded = encoded_actions(predictor.action_space, actions).to(of_actions.dtype)
-        share = F.linear(encoded if own is None else encoded * own, of_actions)
-    for batch in batches:
-        hidden = (F.linear(batch, of_features, first.bias)[:, None] + share).flatten(0, 1)
-        for layer in others:
-            hidden = layer(hidden)
-        yield hidden
+    @property
+    def _first_inputs(self) -> int:
+        """The number of inputs of the action."""
+        return int(self._first.weight.shape[1]) - self.predictor.features_extractor.features_dim
+
+    def _outputs(self, batches: Sequence[th.Tensor], share: th.Tensor) -> Iterator[th.Tensor]:
+        """(n k, outputs) of each pair, for one batch after the other."""
+        _, *others = cast(Iterable[Any], self.predictor.head)
+        of_features = self._first.weight[:, : -self._first_inputs]
+        for batch in batches:
+            hidden = (F.linear(batch, of_features, self._first.bias)[:, None] + share).flatten(0, 1)
+            for layer in others:
+                hidden = layer(hidden)
+            yield hidden

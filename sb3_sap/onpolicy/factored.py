@@ -35,9 +35,15 @@ class FactoredGuide(Guide):
         of_parts = {dimension for dimensions in judged for dimension in dimensions}
         alone = [[dimension] for dimension in range(len(sizes)) if dimension not in of_parts]
         self.blocks = [Block.of(dimensions, sizes, self.device) for dimensions in judged + alone]
-        self._n_judged = len(judged)
-        predictor: Any = self.predictor
-        self._many = [ManyActions(predictor, self.blocks[part].choices, part) for part in range(len(judged))]
+        self._judged = self.blocks[: len(judged)]
+        if self.predictor is not None:
+            # (k, action_dim) every choice of every part, beside which the other dimensions are not seen.
+            choices = [th.zeros((len(block), len(sizes)), dtype=th.long, device=self.device) for block in self._judged]
+            for block, actions in zip(self._judged, choices, strict=True):
+                actions[:, block.dimensions] = block.choices
+            numbers = th.arange(len(judged), device=self.device)
+            self._part_of = numbers.repeat_interleave(th.tensor([len(block) for block in self._judged]).to(self.device))
+            self._many = ManyActions(self.predictor, th.cat(choices), self._part_of)
         self._verdicts = Remembered()
         # In the order of their dimensions, as sb3-contrib's distributions are.
         self._order = sorted(range(len(self.blocks)), key=lambda number: self.blocks[number].dimensions)
@@ -67,8 +73,8 @@ class FactoredGuide(Guide):
         of_e: list[BoolArray] = [np.ones((len(states), len(block)), dtype=bool) for block in self.blocks]
         if self.predictor is not None:
             found = self._verdicts.rows(states, lambda new: self._judge(some_rows(obs, new, len(states))))
-            ends = np.cumsum([len(block) for block in self.blocks[: self._n_judged]])
-            of_e[: self._n_judged] = np.split(found, ends[:-1], axis=1)
+            ends = np.cumsum([len(block) for block in self._judged])
+            of_e[: len(ends)] = np.split(found, ends[:-1], axis=1)
         sizes = self.known.sizes
         masks = [
             within(mask, None if known is None else block.known(known, sizes))
@@ -81,12 +87,6 @@ class FactoredGuide(Guide):
     def _judge(self, obs: Any) -> BoolArray:
         """E's verdicts on the choices of all parts in n states, side by side; what it does not judge, it permits."""
         assert self.predictor is not None
-        features, trusted = self.predictor.features(obs), self.predictor.trusted
-        found = []
-        for part, block in enumerate(self.blocks[: self._n_judged]):
-            if trusted[part]:
-                batches = th.split(features, max(1, PAIRS_AT_ONCE // len(block)))
-                found.append(th.cat(self._many[part].logits(batches)) > 0)
-            else:
-                found.append(th.ones((len(features), len(block)), dtype=th.bool, device=features.device))
-        return th.cat(found, dim=1).cpu().numpy()
+        batches = th.split(self.predictor.features(obs), max(1, PAIRS_AT_ONCE // len(self._part_of)))
+        permitted = th.cat(self._many.logits(batches)) > 0
+        return (permitted | ~self.predictor.trusted[self._part_of]).cpu().numpy()

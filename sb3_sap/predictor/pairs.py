@@ -13,7 +13,6 @@ import torch as th
 from gymnasium import spaces
 from torch.nn import functional as F
 
-from sb3_sap.common.spaces import sizes_of
 from sb3_sap.predictor.encoding import encoded_actions
 from sb3_sap.predictor.network import PermissibilityPredictor
 
@@ -22,15 +21,13 @@ class ManyActions:
     """Many actions, whose share of E's first layer is computed again only after E was fitted.
 
     :param predictor: E
-    :param actions: (k, action_dim), scaled; with ``part`` (k, dimensions of the part)
-    :param part: the part of a ``MultiDiscrete`` or ``MultiBinary`` action that is judged by itself; ``None``: the whole
+    :param actions: (k, action_dim), scaled
+    :param parts: (k,) numbers of the parts of a ``MultiDiscrete`` or ``MultiBinary`` action, of which each action is
+        judged by that one alone; ``None``: by all
     """
 
-    def __init__(self, predictor: PermissibilityPredictor, actions: th.Tensor, part: int | None = None):
-        self.predictor, self.part, self.actions = predictor, part, actions
-        if part is not None:
-            self.actions = actions.new_zeros((len(actions), len(sizes_of(predictor.action_space))))
-            self.actions[:, list(predictor.parts.indices[part])] = actions
+    def __init__(self, predictor: PermissibilityPredictor, actions: th.Tensor, parts: th.Tensor | None = None):
+        self.predictor, self.actions, self.parts = predictor, actions, parts
         self._shares: list[
             th.Tensor
         ] = []  # (k, width) of the first layer, one for each output that sees its own inputs
@@ -44,8 +41,10 @@ class ManyActions:
         if self._fitted != int(self.predictor.n_updates):
             self._shares, self._fitted = self._shares_now(), int(self.predictor.n_updates)
         found: Iterable[th.Tensor]
-        if self.part is not None:
-            found = (outputs[:, self.part] for outputs in self._outputs(batches, self._shares[0]))
+        if self.parts is not None:
+            parts = self.parts
+            each_batch = zip(self._outputs(batches, self._shares[0]), batches, strict=True)
+            found = (outputs.gather(1, parts.repeat(len(batch))[:, None]) for outputs, batch in each_batch)
         elif self.predictor.own_inputs is None:
             found = (self.predictor.of_all(outputs) for outputs in self._outputs(batches, self._shares[0]))
         else:
@@ -53,7 +52,7 @@ class ManyActions:
                 [outputs[:, part] for outputs in self._outputs(batches, share)]
                 for part, share in enumerate(self._shares)
             ]
-            found = (self.predictor.of_all(th.stack(parts, dim=1)) for parts in zip(*each, strict=True))
+            found = (self.predictor.of_all(th.stack(columns, dim=1)) for columns in zip(*each, strict=True))
         return [logits.reshape(-1, len(self.actions)) for logits in found]
 
     def _shares_now(self) -> list[th.Tensor]:
@@ -64,8 +63,9 @@ class ManyActions:
         encoded = encoded_actions(space, self.actions).to(of_actions.dtype)
         if own is None:
             return [F.linear(encoded, of_actions)]
-        seen = own if self.part is None else own[self.part : self.part + 1]
-        return [F.linear(encoded * inputs, of_actions) for inputs in seen]
+        if self.parts is not None:
+            return [F.linear(encoded * own[self.parts], of_actions)]
+        return [F.linear(encoded * inputs, of_actions) for inputs in own]
 
     @property
     def _first(self) -> Any:

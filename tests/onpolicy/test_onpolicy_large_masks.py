@@ -79,7 +79,7 @@ def test_masks_of_parts_are_those_of_all_combinations(space):
 
 
 def raw_masks(guide, obs):
-    return th.as_tensor(guide._judge(obs)).split([len(block) for block in guide.blocks[: guide._n_judged]], dim=1)
+    return th.as_tensor(guide._judge(obs)).split([len(block) for block in guide._judged], dim=1)
 
 
 @pytest.mark.parametrize("algorithm", [PPOAP, A2CAP, TRPOAP, RecurrentPPOAP])

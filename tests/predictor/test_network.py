@@ -237,7 +237,9 @@ def test_part_of_a_finite_action_is_judged_from_its_own_dimensions_alone(space):
     each = e.part_logits(features.repeat_interleave(k, dim=0), whole.repeat(4, 1)).reshape(4, k, 2)
     choices = [th.as_tensor(np.unique(actions[:, own], axis=0)) for own in ([1], [2, 0])]
     for part, own in enumerate(([1], [2, 0])):
-        found = th.cat(ManyActions(e, choices[part], part).logits(features.split(3)))
+        alone = th.zeros((len(choices[part]), len(whole[0])), dtype=th.long)
+        alone[:, own] = choices[part].long()
+        found = th.cat(ManyActions(e, alone, th.full((len(alone),), part)).logits(features.split(3)))
         for column, choice in enumerate(choices[part]):
             same = (whole[:, own] == choice).all(dim=1)
             expected = found[:, column, None].expand(4, int(same.sum()))

@@ -29,8 +29,8 @@ SEEDS, STEPS, EPISODES, DIMENSIONS = (100, 101, 102), 2_048, 20, 8
 class Switches(gym.Env[Any, Any]):
     """Eight switches of three positions: the reward is the share that stand as their lamps say, for 50 steps.
 
-    A lamp shows a number from -1 to 1, whose thirds are the positions. Position 0 below a lamp of the highest third, and
-    position 2 below one of the lowest third, break something.
+    A lamp shows a number from -1 to 1, whose thirds are the positions. Position 0 below a lamp of the highest third
+    breaks something, and so does position 2 below one of the lowest third.
     """
 
     observation_space = spaces.Box(-1.0, 1.0, (DIMENSIONS,), np.float32)
@@ -114,7 +114,7 @@ def main() -> None:
         row = {"masks": name, "seeds": len(SEEDS), "steps": f"{STEPS:,}"}
         row |= {title: f"{found[key].mean():.1f} ({found[key].min():.1f})" for title, key in RETURNS.items()}
         labelled = "ap_function" in settings
-        row["mistakes"] = f"{found['mistakes'].mean():.1%}" if labelled else "0.0%"
+        row["mistakes"] = f"{found['mistakes'].mean():.1%}" if labelled else ""
         row["accuracy of E"] = f"{found['accuracy'].mean():.2f}" if labelled else ""
         rows.append(row | {"ms per step": f"{1000 * found['seconds'].mean() / STEPS:.1f}"})
         print(rows[-1], flush=True)

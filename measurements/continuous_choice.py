@@ -17,7 +17,8 @@ from gymnasium import spaces
 from scipy.stats import norm
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 
-from sb3_sap.onpolicy.guide import Guide
+from sb3_sap.onpolicy.draws import DrawingGuide
+from sb3_sap.onpolicy.known import KnownMasks
 
 SIGMA, BEST, SAMPLES = 0.5, 0.9, 400_000
 #: Shares of the policy's actions that E permits, numbers of draws, and errors of the value in standard deviations.
@@ -53,7 +54,8 @@ def estimates(mean: float, n: int, error: float, rng: np.random.Generator) -> di
     """Mean and standard deviation of each estimate of the gradient, from one action."""
     space = spaces.Box(-1, 1, (1,))
     judge: Any = Above()
-    guide = Guide(judge, space, n, squashed=False, device=th.device("cpu"))
+    settings = {"n_candidates": n, "squashed": False, "predicts": True}  # which keeps no draws for an update
+    guide = DrawingGuide(judge, space, KnownMasks([]), th.device("cpu"), **settings)
     distribution = DiagGaussianDistribution(1).proba_distribution(
         th.full((SAMPLES, 1), mean), th.full((SAMPLES, 1), float(np.log(SIGMA)))
     )

@@ -1,8 +1,9 @@
 """Measures what permissibility costs per training step of PPO: PPOAP beside PPO with the same settings.
 
 `mask` and `draws` are `alpha=1`, the masks of finite actions and the draws of continuous ones; `loss` is the preset of
-that name. The two models of a pair train in turn, a rollout at a time, in one process and thread, so that other work
-on the machine affects both. The parts are measured inside the guided model.
+that name; `small E` has two hidden layers of 64 units instead of 128 and 256. The two models of a pair train in turn, a
+rollout at a time, in one process and thread, so that other work on the machine affects both. The parts are measured
+inside the guided model.
 
 Processor time is measured after the first 2,048 steps, whose labels are fitted eight times as often as later ones.
 What these steps cost more than PPO's, once in a training however long it is, is in a column of its own.
@@ -28,7 +29,8 @@ from step_cost import seconds, timed
 from sb3_sap import PPOAP, preset
 from sb3_sap.benchmark.provenance import provenance
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_text
-from sb3_sap.onpolicy.guide import Guide
+from sb3_sap.onpolicy.draws import DrawingGuide
+from sb3_sap.onpolicy.enumerated import EnumeratedGuide
 from sb3_sap.onpolicy.labels import LabelCallback
 from sb3_sap.onpolicy.loss import PermissibilityLoss
 from sb3_sap.predictor.callbacks import PermissibilityCallback
@@ -100,6 +102,11 @@ CASES = {
     "actions": Case(Target, {"n_steps": 512}, {"ap_function": not_far}, 4_096, 1.5),
     "torcs": Case(torcs, preset("tuned", "ppo"), {}, 3_072, 1.25),
 }
+WAYS = {
+    "cartpole": ("mask", "loss"),
+    "actions": ("mask", "loss", "mask, small E", "loss, small E"),
+    "torcs": ("draws", "loss"),
+}
 TITLES = {
     "cartpole": "CartPole-v1, 8 environments",
     "actions": f"{ACTIONS:,} actions",
@@ -112,9 +119,9 @@ def watch_the_parts() -> None:
         (LabelCallback, "_on_step", "labels"),
         (PermissibilityCallback, "fit", "fit E"),
         (PermissibilityCallback, "validate", "validate E"),
-        (Guide, "distribution", "guide"),
-        (Guide, "first_permissible", "guide"),
-        (Guide, "log_prob", "guide"),
+        (EnumeratedGuide, "distribution", "guide"),
+        (DrawingGuide, "first_permissible", "guide"),
+        (DrawingGuide, "log_prob", "guide"),
         (PermissibilityLoss, "added_to", "loss"),
     )
     for cls, method, name in watched:
@@ -124,7 +131,9 @@ def watch_the_parts() -> None:
 def measure(name: str, way: str) -> dict[str, object]:
     """One row: milliseconds per step of both models, and of the parts of the guided one."""
     case = CASES[name]
-    own = preset("loss", PPOAP) if way == "loss" else {"alpha": 1}
+    own: dict[str, Any] = preset("loss", PPOAP) if way.startswith("loss") else {"alpha": 1}
+    if way.endswith("small E"):
+        own["predictor_kwargs"] = {"net_arch": [64, 64]}
     arguments: dict[str, Any] = {"policy": "MlpPolicy", "seed": 100, "device": "cpu", **case.settings}
     models: list[Any] = [
         PPO(env=case.make_env(), **arguments),
@@ -163,7 +172,7 @@ def main() -> None:
     made = provenance()
     rows = []
     for name in options.cases:
-        for way in ("draws" if name == "torcs" else "mask", "loss"):
+        for way in WAYS[name]:
             rows.append(measure(name, way))
             print(rows[-1], flush=True)
     table = pd.DataFrame(rows)

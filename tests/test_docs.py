@@ -333,6 +333,7 @@ NOTEBOOKS = {
     "02_lane_keeping": {"STEPS": 800, "TEST_TRACKS": ["g-track-3"]},
     "03_your_own_problem": {"STEPS": 1_200, "TRIALS": 2},
     "04_logs": {"LOGGED": 1_000, "STEPS": 160, "TRACKS": ["g-track-3"]},
+    "05_ppo_and_masks": {"STEPS": 512, "LANE_STEPS": 768},
 }
 
 

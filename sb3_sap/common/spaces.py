@@ -39,11 +39,10 @@ def check_action_space(algorithm: str, space: spaces.Space[Any], discrete: bool 
         _check_box(algorithm, space)
 
 
-def check_any_action_space(algorithm: str, space: spaces.Space[Any], most: int) -> None:
-    """Checks that an on-policy algorithm can judge each action of a space.
+def check_any_action_space(algorithm: str, space: spaces.Space[Any]) -> None:
+    """Checks that an on-policy algorithm can use an action space.
 
     :param algorithm: its name, for the error message
-    :param most: maximum number of combinations of a ``MultiDiscrete`` or ``MultiBinary`` space
     :raise ValueError: if the algorithm cannot use the space
     """
     if isinstance(space, (spaces.Box, spaces.Discrete)):
@@ -58,12 +57,6 @@ def check_any_action_space(algorithm: str, space: spaces.Space[Any], most: int) 
         raise ValueError(
             f"{algorithm} needs actions that count from 0, as SB3's algorithms do, but this `env` has {space}: add "
             "`start` in gymnasium.wrappers.TransformAction."
-        )
-    combinations = math.prod(sizes_of(space))
-    if combinations > most:
-        raise ValueError(
-            f"{algorithm} judges every combination of actions, of which there may be at most {most:,}, but {space} has "
-            f"{combinations:,}: leave out or coarsen some dimensions of the action space."
         )
 
 

@@ -40,7 +40,6 @@ class ObservedMask:
     def __init__(self, key: str, observation_space: spaces.Dict, action_space: spaces.Space[Any]):
         self.key = key
         self.sizes = sizes_of(action_space)
-        self.actions = joint_actions(action_space).reshape(-1, len(self.sizes))
         shape = observation_space[key].shape
         self.joint = len(self.sizes) > 1 and shape == tuple(self.sizes)
         if not self.joint and shape != (sum(self.sizes),):
@@ -52,19 +51,26 @@ class ObservedMask:
 
     def masks(self, obs: Any) -> BoolArray:
         """(n, k) bool, which of all k actions n observations list as permissible."""
-        entry = np.asarray(obs[self.key]) > 0.5  # 0 and 1 may have been normalised and recovered
-        if self.joint:
-            return entry.reshape(len(entry), -1)
-        ends = np.cumsum(self.sizes)
-        columns = [entry[:, end - size : end] for size, end in zip(self.sizes, ends, strict=True)]
-        return np.asarray(
-            np.logical_and.reduce([one[:, choice] for one, choice in zip(columns, self.actions.T, strict=True)])
-        )
+        if not self.joint:
+            return joint_masks(self.choices(obs), self.sizes)
+        entry = self._entry(obs)
+        return entry.reshape(len(entry), -1)
+
+    def choices(self, obs: Any) -> BoolArray:
+        """(n, sum of sizes) bool, for each choice of each dimension. Where none of a dimension is listed, all are."""
+        columns = np.split(self._entry(obs), np.cumsum(self.sizes)[:-1], axis=1)
+        return np.concatenate([column | ~column.any(axis=1, keepdims=True) for column in columns], axis=1)
+
+    def _entry(self, obs: Any) -> BoolArray:
+        return np.asarray(np.asarray(obs[self.key]) > 0.5)  # 0 and 1 may have been normalised and recovered
 
     def __call__(self, obs: Any, actions: np.ndarray[Any, Any]) -> BoolArray:
         chosen = np.asarray(actions).reshape(len(actions), len(self.sizes)).astype(int)
-        index = np.ravel_multi_index(tuple(chosen.T), self.sizes)
-        return np.asarray(self.masks(obs)[np.arange(len(index)), index])
+        rows = np.arange(len(chosen))
+        if self.joint:
+            return np.asarray(self.masks(obs)[rows, np.ravel_multi_index(tuple(chosen.T), self.sizes)])
+        starts = np.cumsum(self.sizes) - self.sizes
+        return np.asarray(self.choices(obs)[rows[:, None], chosen + starts].all(axis=1))
 
 
 def mask_source(
@@ -94,6 +100,24 @@ def mask_source(
     return ObservedMask(permissible_actions, observation_space, action_space)
 
 
+def joint_masks(choices: BoolArray, sizes: list[int]) -> BoolArray:
+    """(n, k) masks of all combinations, the last dimension fastest, from masks of each dimension, (n, sum of sizes)."""
+    first, *others = np.split(choices, np.cumsum(sizes)[:-1], axis=1)
+    for column in others:
+        first = (first[:, :, None] & column[:, None, :]).reshape(len(first), -1)
+    return first
+
+
+def known_masks_of(source: PermissibleActions, action_space: spaces.Space[Any], obs: Any) -> BoolArray:
+    """Masks in the form that their source has: of each choice of each dimension, or as :func:`masks_of` gives them.
+
+    :param obs: n raw observations
+    """
+    if isinstance(source, ObservedMask) and not source.joint:
+        return source.choices(obs)
+    return masks_of(source, action_space, obs)
+
+
 def masks_of(source: PermissibleActions, action_space: spaces.Space[Any], obs: Any) -> BoolArray:
     """(n, k) bool, which of all k actions of a finite space may be executed in n states; where none may, all.
 
@@ -111,9 +135,9 @@ def masks_of(source: PermissibleActions, action_space: spaces.Space[Any], obs: A
 
 
 def masks_at(model: Any, source: PermissibleActions, observation: Any) -> BoolArray:
-    """The same for one observation or a batch, as ``predict`` takes it."""
+    """What :func:`known_masks_of` gives for one observation or a batch, as ``predict`` takes it."""
     check_statistics(model, source)
-    return masks_of(source, model.action_space, model.raw_observations(observation))
+    return known_masks_of(source, model.action_space, model.raw_observations(observation))
 
 
 def check_statistics(model: Any, source: PermissibleActions | None) -> None:

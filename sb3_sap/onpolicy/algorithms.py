@@ -6,6 +6,7 @@ from sb3_contrib import TRPO, RecurrentPPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_sap.onpolicy.choosing import by_part, too_many
 from sb3_sap.onpolicy.mixin import OnPolicyPermissibilityMixin
 
 
@@ -26,6 +27,11 @@ class TRPOAP(OnPolicyPermissibilityMixin, TRPO):
             raise ValueError(
                 f"`permissibility_coef` = {self.permissibility_coef!r} cannot be used by TRPOAP, whose step is a line "
                 "search on the policy's own objective: leave it out, or choose PPOAP."
+            )
+        if self.alpha and too_many(self.action_space) and not by_part(True, self.parts, self._permissible_actions):
+            raise ValueError(
+                f"TRPOAP bounds the divergence of the guided policy, which cannot be computed for {self.action_space}: "
+                "give `action_parts` and labels of each, choose PPOAP, or set `alpha=0`."
             )
 
 

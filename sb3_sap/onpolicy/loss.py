@@ -7,15 +7,17 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.distributions import Distribution
-from torch.nn import functional as F
 
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.onpolicy.guide import Guide
-from sb3_sap.onpolicy.masks import joint_log_probs
 
 
 class PermissibilityLoss:
-    """β times :func:`losses`, whose gradient joins that of the base algorithm's own loss.
+    """β times :meth:`~sb3_sap.onpolicy.guide.Guide.losses`, whose gradient joins that of the base algorithm's own loss.
+
+    For continuous actions softplus(−E(s, mode)), the cross-entropy of the mode under E, had it been labelled
+    permissible. For finite actions −log of the probability that the policy gives to what E permits: masked actions
+    have no gradient, so that without it the policy alone might take one that it never tried.
 
     :param guide: with E, and with the known masks of the rollout
     :param coef: β times the trust in the labels, in units of the advantages that the base learns from
@@ -36,7 +38,7 @@ class PermissibilityLoss:
         :param distribution: of the policy alone in these states
         :param recurrent: whether zeros pad the sequences of observations
         """
-        found = losses(self.guide, obs, distribution)
+        found = self.guide.losses(obs, distribution)
         if recurrent:
             entries = obs.values() if isinstance(obs, dict) else [obs]
             real = th.stack([entry.flatten(1).ne(0).any(dim=1) for entry in entries]).any(dim=0)
@@ -56,25 +58,3 @@ class _WithLoss(th.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> Any:
         return gradient, th.ones((), dtype=gradient.dtype, device=gradient.device)
-
-
-def losses(guide: Guide, obs: Any, distribution: Distribution) -> th.Tensor:
-    """(n,) how much a policy errs in n states, according to E.
-
-    For continuous actions softplus(−E(s, mode)), the cross-entropy of the mode under E, had it been labelled
-    permissible. For finite actions −log of the probability that the policy gives to what E permits: masked actions
-    have no gradient, so that without it the policy alone might take one that it never tried.
-
-    :param obs: n observation tensors
-    :param distribution: of the policy alone in these states
-    """
-    if guide.actions is None:
-        assert guide.predictor is not None
-        mode = distribution.mode()
-        # A mode outside the bounds is executed at the bound, where E judges it; the gradient may lead it back.
-        clipped = guide.scaled(mode)
-        free = mode if guide.squashed else guide.scaled_freely(mode)
-        features = guide.predictor.features(obs).detach()
-        return F.softplus(-guide.predictor.logits(features, free + (clipped - free).detach()))
-    mask = guide.mask(obs)
-    return -joint_log_probs(distribution, guide.actions).masked_fill(~mask, -th.inf).logsumexp(dim=1)

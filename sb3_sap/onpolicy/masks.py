@@ -23,23 +23,40 @@ from sb3_sap.common.spaces import sizes_of
 REJECTED_LOGIT = -1e8
 
 
-def joint_log_probs(distribution: Distribution, actions: th.Tensor) -> th.Tensor:
-    """(n, k) log-probabilities of k joint actions in n states: the dimensions of SB3's policies are independent.
+def log_probs_of_dimensions(distribution: Distribution) -> list[th.Tensor]:
+    """(n, size) log-probabilities of the choices in each dimension, which in SB3's policies are independent.
 
-    :param actions: (k, action_dim), those of :func:`~sb3_sap.common.spaces.joint_actions`
     :raise TypeError: for a distribution that is none of SB3's over finite actions
     """
     if isinstance(distribution, CategoricalDistribution):
-        return distribution.distribution.logits
+        return [distribution.distribution.logits]
     if isinstance(distribution, MultiCategoricalDistribution):
-        columns = zip(distribution.distribution, actions.unbind(dim=1), strict=True)
-        return th.stack([one.logits[:, column] for one, column in columns]).sum(dim=0)
+        return [one.logits for one in distribution.distribution]
     if isinstance(distribution, BernoulliDistribution):
-        logits, ones = distribution.distribution.logits, actions.to(distribution.distribution.logits.dtype)
-        return F.logsigmoid(logits) @ ones.T + F.logsigmoid(-logits) @ (1 - ones).T
+        logits = distribution.distribution.logits
+        return list(th.stack([F.logsigmoid(-logits), F.logsigmoid(logits)], dim=2).unbind(dim=1))
     raise TypeError(
         f"The policy's {type(distribution).__name__} cannot be masked: use a policy of SB3's distributions."
     )
+
+
+def joint_log_probs(distribution: Distribution, actions: th.Tensor) -> th.Tensor:
+    """(n, k) log-probabilities of k joint actions in n states.
+
+    :param actions: (k, action_dim), those of :func:`~sb3_sap.common.spaces.joint_actions`
+    """
+    of_dimensions = log_probs_of_dimensions(distribution)
+    if len(of_dimensions) == 1:
+        return of_dimensions[0]
+    columns = zip(of_dimensions, actions.long().unbind(dim=1), strict=True)
+    return th.stack([one[:, column] for one, column in columns]).sum(dim=0)
+
+
+def masked_categorical(log_probs: th.Tensor, mask: th.Tensor) -> Categorical:
+    """(n, k) log-probabilities, given what (n, k) masks permit."""
+    rejected = th.tensor(REJECTED_LOGIT, dtype=log_probs.dtype, device=log_probs.device)
+    # The policy's own distribution has checked its logits.
+    return Categorical(logits=th.where(mask, log_probs, rejected), validate_args=False)
 
 
 class MaskedDistribution(CategoricalDistribution):
@@ -56,9 +73,7 @@ class MaskedDistribution(CategoricalDistribution):
 
     def __init__(self, log_probs: th.Tensor, mask: th.Tensor, space: spaces.Space[Any], actions: th.Tensor):
         super().__init__(len(actions))
-        rejected = th.tensor(REJECTED_LOGIT, dtype=log_probs.dtype, device=log_probs.device)
-        # The policy's own distribution has checked its logits.
-        self.distribution = Categorical(logits=th.where(mask, log_probs, rejected), validate_args=False)
+        self.distribution = masked_categorical(log_probs, mask)
         self.space = space
         self.actions = actions
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import torch as th
@@ -22,6 +22,7 @@ from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import FloatArray, Observations
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.common.vec_envs import policy_layout
+from sb3_sap.predictor.encoding import encoded_actions, own_inputs
 from sb3_sap.predictor.knowledge import LabelledActions
 from sb3_sap.predictor.weights import read_predictor, write_predictor
 
@@ -35,8 +36,9 @@ class PermissibilityPredictor(BaseModel):
     Its inputs are observations as the policy gets them, and actions scaled to [-1, 1], or one-hot if they are discrete
     (in each dimension of a ``MultiDiscrete``); those of a ``MultiBinary`` are as they are.
 
-    With ``action_parts`` it has an output for each of k parts of the action, over shared layers, each of which sees the
-    whole action. The logit of the action is then the lowest of the parts that are accurate enough.
+    With ``action_parts`` it has an output for each of k parts of the action, over shared layers. Of a ``Box`` each sees
+    the whole action; of a ``MultiDiscrete`` or ``MultiBinary`` its own dimensions alone, the others being zeros, so
+    that it judges the part by itself. The logit of the action is then the lowest of the parts that are accurate enough.
 
     :param observation_space: of the environment
     :param action_space: of the environment
@@ -110,6 +112,9 @@ class PermissibilityPredictor(BaseModel):
         self.register_buffer("n_updates", th.zeros((), dtype=th.long))
         if self.parts:
             self.register_buffer("accuracies", th.full((len(self.parts),), th.nan))
+        #: (k, input_dim) which of the encoded action's inputs each part sees; ``None``: all.
+        self.own_inputs: th.Tensor | None
+        self.register_buffer("own_inputs", own_inputs(action_space, self.parts), persistent=False)
         # The gradient of the L2 term λ/2 ‖θ_E‖² is λ θ_E, which torch.optim calls weight decay.       # Eq. (7)
         self.optimizer = optimizer_class(
             self.parameters(),
@@ -183,9 +188,9 @@ class PermissibilityPredictor(BaseModel):
 
         With parts, an action is permissible unless a part that is accurate enough is not.
         """
-        return self._of_all(self.part_logits(features, actions))
+        return self.of_all(self.part_logits(features, actions))
 
-    def _of_all(self, of_parts: th.Tensor) -> th.Tensor:
+    def of_all(self, of_parts: th.Tensor) -> th.Tensor:
         """(n,) logits of the whole action from (n, k) of its parts."""
         if not self.parts:
             return of_parts.squeeze(1)
@@ -193,9 +198,20 @@ class PermissibilityPredictor(BaseModel):
 
     def part_logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """(n, k) logits that each of k parts of the action is permissible; without parts (n, 1)."""
-        actions = _encoded(self.action_space, actions)
         # A float64 action space brings float64 actions.
-        return self.head(th.cat([features, actions.to(features.dtype)], dim=1))  # type: ignore[no-any-return]
+        encoded = encoded_actions(self.action_space, actions).to(features.dtype)
+        if self.own_inputs is None:
+            return self.head(th.cat([features, encoded], dim=1))  # type: ignore[no-any-return]
+        columns = [self._own_logits(features, encoded, number) for number in range(len(self.parts))]
+        return th.stack(columns, dim=1)
+
+    def _own_logits(self, features: th.Tensor, encoded: th.Tensor, part: Any) -> th.Tensor:
+        """(n,) logits of one part, or of an (n,) tensor of parts, which sees its own inputs alone."""
+        assert self.own_inputs is not None
+        of_parts = self.head(th.cat([features, encoded * self.own_inputs[part]], dim=1))
+        if isinstance(part, int):
+            return of_parts[:, part]  # type: ignore[no-any-return]
+        return of_parts.gather(1, part[:, None]).squeeze(1)  # type: ignore[no-any-return]
 
     @property
     def judged_parts(self) -> list[int]:
@@ -206,29 +222,6 @@ class PermissibilityPredictor(BaseModel):
     def trusted(self) -> th.Tensor:
         """(k,) which parts are accurate enough, each as the whole action is without parts (section 4.3)."""
         return self.accuracies >= SUFFICIENT_ACCURACY
-
-    def logits_of_each(self, batches: Sequence[th.Tensor], actions: th.Tensor) -> list[th.Tensor]:
-        """(n, k) logits of k actions in the n states of each batch.
-
-        For many actions far faster than :meth:`logits`: of the first layer, whose inputs are mostly those of a one-hot
-        action, features and actions have their shares once. The logits differ by rounding alone.
-
-        :param batches: (n, features_dim) features
-        :param actions: (k, action_dim), scaled
-        """
-        first, *others = cast(Iterable[Any], self.head)
-        of_features, of_actions = first.weight.tensor_split([batches[0].shape[1]], dim=1)
-        if isinstance(self.action_space, spaces.Discrete):
-            share = of_actions.t()[actions.flatten().long()]
-        else:
-            share = F.linear(_encoded(self.action_space, actions).to(of_actions.dtype), of_actions)
-        found = []
-        for batch in batches:
-            hidden = (F.linear(batch, of_features, first.bias)[:, None] + share).flatten(0, 1)
-            for layer in others:
-                hidden = layer(hidden)
-            found.append(self._of_all(hidden).reshape(len(batch), -1))
-        return found
 
     def forward(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of n observations and (n, action_dim) scaled actions."""
@@ -241,7 +234,13 @@ class PermissibilityPredictor(BaseModel):
         if not self.parts:
             return F.binary_cross_entropy_with_logits(self(obs, actions), labels)  # Eq. (7)
         known = ~labels.isnan()
-        return F.binary_cross_entropy_with_logits(self.part_logits(self.features(obs), actions)[known], labels[known])
+        if self.own_inputs is None:
+            found = self.part_logits(self.features(obs), actions)[known]
+        else:  # of each row the parts alone that it has labels of
+            rows, numbers = known.nonzero(as_tuple=True)
+            encoded = encoded_actions(self.action_space, actions).to(labels.dtype)
+            found = self._own_logits(self.features(obs)[rows], encoded[rows], numbers)
+        return F.binary_cross_entropy_with_logits(found, labels[known])
 
     @flush_denormals()
     def fit(self, dataset: LabelledActions) -> float:
@@ -314,16 +313,6 @@ def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None
         raise ValueError(f"`batch_size` must be a whole number of at least 1, but is {batch_size!r}.")
     if not (isinstance(learning_rate, Real) and float(learning_rate) >= 0):
         raise ValueError(f"`learning_rate` of the predictor must be a number of at least 0, but is {learning_rate!r}.")
-
-
-def _encoded(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:
-    """(n, input_dim) actions as E sees them."""
-    if isinstance(space, spaces.Discrete):
-        return F.one_hot(actions.flatten().long(), int(space.n))
-    if isinstance(space, spaces.MultiDiscrete):
-        columns = zip(actions.long().unbind(dim=1), space.nvec.tolist(), strict=True)
-        return th.cat([F.one_hot(column, n) for column, n in columns], dim=1)
-    return actions
 
 
 def query_candidates(

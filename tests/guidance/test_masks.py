@@ -103,6 +103,50 @@ def test_masks_of_several_dimensions_are_never_violated(algorithm, space, joint)
     assert_never_illegal(model_of(algorithm, env, "MultiInputPolicy", permissible_actions="action_mask"))
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "space"),
+    [*((algorithm, spaces.MultiDiscrete([17] * 3)) for algorithm in ON_POLICY), (PPOAP, spaces.MultiBinary(13))],
+)
+def test_masks_of_dimensions_hold_for_any_number_of_combinations(algorithm, space):
+    env = vectorised(wrap=ActionMaskObservation, action_space=space)
+    settings = {"permissible_actions": "action_mask", "alpha": 0}
+    assert_never_illegal(model_of(algorithm, env, "MultiInputPolicy", **settings), steps=32)
+
+
+@pytest.mark.parametrize("space", [MULTI_DISCRETE, spaces.MultiDiscrete([17] * 3)], ids=str)
+def test_masks_of_dimensions_give_the_trajectory_of_maskable_ppo(space):
+    settings = {
+        "n_steps": 16,
+        "batch_size": 16,
+        "n_epochs": 3,
+        "ent_coef": 0.01,
+        "seed": 1,
+        "policy_kwargs": {"net_arch": [8]},
+    }
+    envs = [vectorised(wrap=ActionMaskObservation, action_space=space) for _ in range(2)]
+    ours = PPOAP("MultiInputPolicy", envs[0], permissible_actions="action_mask", **settings).learn(64)
+    theirs = MaskablePPO("MultiInputPolicy", envs[1], **settings).learn(64)
+    for name, value in ours.policy.state_dict().items():
+        assert th.equal(value, theirs.policy.state_dict()[name]), name
+
+
+def test_predictor_of_combinations_keeps_within_the_masks_of_dimensions():
+    """Where E permits nothing of what is allowed, all of that is allowed."""
+    env = vectorised(wrap=ActionMaskObservation, action_space=spaces.MultiBinary(13))
+    settings = {"min_per_class": 4, "dataset_size": 8, "validation_size": 4, "predictor_kwargs": {"net_arch": [8]}}
+    model = model_of(
+        PPOAP,
+        env,
+        "MultiInputPolicy",
+        permissible_actions="action_mask",
+        ap_function=lambda obs, actions, next_obs: actions[:, 0] == actions[:, 1],
+        **settings,
+    )
+    model.validation_accuracy = 1.0
+    model.predictor.n_updates += 1
+    assert_never_illegal(model, steps=32)
+
+
 @pytest.mark.parametrize("algorithm", [DQNAP, PPOAP])
 def test_normalised_observations_beside_a_mask(algorithm):
     env = VecNormalize(vectorised(wrap=ActionMaskObservation), norm_obs_keys=["observation"])

@@ -12,7 +12,7 @@ from stubs import above
 from toy import Line, centred, towards_centre
 
 from sb3_sap import A2CAP, PPOAP, PermissibilityCallback, RecurrentPPOAP
-from sb3_sap.onpolicy.loss import PermissibilityLoss, losses
+from sb3_sap.onpolicy.loss import PermissibilityLoss
 from sb3_sap.onpolicy.trust import Agreement
 from sb3_sap.predictor.schedule import weighted_labels
 
@@ -168,7 +168,7 @@ def test_gradient_of_the_loss_joins_that_of_the_base():
         return log_std.grad.clone(), action_net.grad.clone()
 
     def loss_alone():
-        return 0.7 * losses(model._guide(), obs, model.policy.get_distribution(obs)).mean()
+        return 0.7 * model._guide().losses(obs, model.policy.get_distribution(obs)).mean()
 
     base = gradients(lambda: model.policy.evaluate_actions(obs, actions)[1].sum())
     extra = gradients(lambda: loss_alone() + 0 * log_std.sum())

@@ -10,6 +10,7 @@ from torch import nn
 from sb3_sap import PermissibilityPredictor
 from sb3_sap.common.spaces import joint_actions
 from sb3_sap.predictor.knowledge import LabelledActions
+from sb3_sap.predictor.pairs import ManyActions
 
 OBS, ACTIONS = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
 
@@ -209,4 +210,49 @@ def test_many_actions_are_judged_as_each_of_them_is(space):
     actions = th.as_tensor(actions.reshape(len(actions), -1))
     k = len(actions)
     each = e.logits(features.repeat_interleave(k, dim=0), actions.repeat(4, 1)).reshape(4, k)
-    th.testing.assert_close(th.cat(e.logits_of_each(features.split(3), actions)), each)
+    th.testing.assert_close(th.cat(ManyActions(e, actions).logits(features.split(3))), each)
+
+
+def test_actions_are_judged_anew_after_a_fit():
+    e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), spaces.Discrete(5), net_arch=[8])
+    many, features = ManyActions(e, th.arange(5)), th.rand(2, 3)
+    before = many.logits([features])[0]
+    with th.no_grad():
+        e.head[0].weight += 1.0
+    e.n_updates += 1
+    after = many.logits([features])[0]
+    assert not th.equal(before, after)
+    each = e.logits(features.repeat_interleave(5, dim=0), th.arange(5).repeat(2)[:, None]).reshape(2, 5)
+    th.testing.assert_close(after, each)
+
+
+@pytest.mark.parametrize("space", [spaces.MultiDiscrete([4, 2, 3]), spaces.MultiBinary(3)])
+def test_part_of_a_finite_action_is_judged_from_its_own_dimensions_alone(space):
+    e = PermissibilityPredictor(
+        spaces.Box(-1, 1, (3,)), space, net_arch=[8, 8], action_parts={"middle": [1], "rest": [2, 0]}
+    )
+    e.accuracies[:] = 1.0
+    features, actions = th.rand(4, 3), joint_actions(space)
+    k, whole = len(actions), th.as_tensor(actions)
+    each = e.part_logits(features.repeat_interleave(k, dim=0), whole.repeat(4, 1)).reshape(4, k, 2)
+    choices = [th.as_tensor(np.unique(actions[:, own], axis=0)) for own in ([1], [2, 0])]
+    for part, own in enumerate(([1], [2, 0])):
+        alone = th.zeros((len(choices[part]), len(whole[0])), dtype=th.long)
+        alone[:, own] = choices[part].long()
+        found = th.cat(ManyActions(e, alone, th.full((len(alone),), part)).logits(features.split(3)))
+        for column, choice in enumerate(choices[part]):
+            same = (whole[:, own] == choice).all(dim=1)
+            expected = found[:, column, None].expand(4, int(same.sum()))
+            th.testing.assert_close(each[:, same, part], expected)
+    th.testing.assert_close(th.cat(ManyActions(e, whole).logits(features.split(3))), each.min(dim=2).values)
+
+
+def test_part_of_a_finite_action_is_learned_from_the_rows_that_have_its_label():
+    space = spaces.MultiDiscrete([2, 2])
+    e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), space, net_arch=[8], action_parts={"a": [0], "b": [1]})
+    obs, actions = th.rand(4, 3), th.as_tensor(joint_actions(space))
+    labels = th.tensor([[1.0, th.nan], [th.nan, 0.0], [0.0, 1.0], [th.nan, th.nan]])
+    logits = e.part_logits(obs, actions)
+    known = th.stack([logits[0, 0], logits[1, 1], logits[2, 0], logits[2, 1]])
+    expected = th.nn.functional.binary_cross_entropy_with_logits(known, th.tensor([1.0, 0.0, 0.0, 1.0]))
+    th.testing.assert_close(e.loss(obs, actions, labels), expected)

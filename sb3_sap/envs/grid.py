@@ -16,8 +16,8 @@ class LabelledGrid(gym.Wrapper[Any, Any, Any, Any]):
     """A task of MiniGrid that calls an action without effect a mistake, in ``info["permissible"]``.
 
     *Argument.* The agent walked into a wall, or there was nothing to pick up, drop or open. The reward falls with the
-    steps taken, or is discounted, so that the same state a step later is worth less than now: the label is sound. A step
-    that ends the episode is not judged, because in some tasks the action without effect says "done".
+    steps taken, and is discounted besides, so that the same state a step later is worth less than now: the label is
+    sound. A step that ends the episode is not judged, because in some tasks the action without effect says "done".
 
     The observation is the view of 7 by 7 cells ahead, one-hot, and the direction, one-hot. The mission, a sentence, is
     left out: tasks in which it changes cannot be learned from it.
@@ -54,7 +54,5 @@ class LabelledGrid(gym.Wrapper[Any, Any, Any, Any]):
         """All that an action can change: the grid, the agent's place and direction, and what it carries."""
         grid: Any = self.unwrapped
         carried = None if grid.carrying is None else grid.carrying.encode()
-        return (
-            grid.grid.encode().tobytes()
-            + repr((tuple(map(int, grid.agent_pos)), int(grid.agent_dir), carried)).encode()
-        )
+        agent = (*map(int, grid.agent_pos), int(grid.agent_dir), carried)
+        return bytes(grid.grid.encode().tobytes()) + repr(agent).encode()

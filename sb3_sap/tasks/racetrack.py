@@ -23,8 +23,8 @@ NEAR_CAR = 25.0
 
 
 def racetrack(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
-    """``racetrack-v0``: False where the step turned the car away from the middle of its lane, while its course lies more
-    than `TOLERANCE` beside it and no other car is within `NEAR_CAR`.
+    """``racetrack-v0``: False where the step turned the car away from the middle of its lane, while its course lies
+    more than `TOLERANCE` beside it and no other car is within `NEAR_CAR`.
 
     The course is the lateral offset from the middle of the nearest lane, `AHEAD` metres on with the present angle
     between car and lane. The steering decides it at once, while the offset itself follows a step later.

@@ -8,7 +8,7 @@ from sb3_sap.tasks.racetrack import car_near, course
 
 
 def seen(offset, angle=0.0, other=None):
-    """An observation of a car at an offset, m, and an angle, rad, from its lane, and another car at (x, y) m from it."""
+    """What a car sees at an offset, m, and an angle, rad, from its lane, with another car at (x, y) m from it."""
     obs = np.zeros((1, 2, 7), dtype=np.float32)
     obs[0, 0] = 1, 0.5, 0.2, 1, 0, offset, angle
     if other is not None:

@@ -50,6 +50,8 @@ GUIDANCE = (
     "action_parts",
     "event",
     "horizon",
+    "risk_discount",
+    "risk_threshold",
     "potential",
     "constraint",
     "permissible_actions",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -27,9 +27,9 @@ class LabelledGrid(gym.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, env: gym.Env[Any, Any]):
-        from minigrid.wrappers import OneHotPartialObsWrapper
+        from minigrid import wrappers
 
-        one_hot = OneHotPartialObsWrapper(env)
+        one_hot = cast(Any, wrappers).OneHotPartialObsWrapper(env)
         super().__init__(one_hot)
         image = one_hot.observation_space["image"]
         self.observation_space = spaces.Box(0, 1, (int(np.prod(image.shape)) + DIRECTIONS,), np.uint8)

@@ -27,7 +27,6 @@ CART_POLE: dict[str, dict[str, Any]] = {
     "no guidance": {**FALL, "horizon": 12, "alpha": 0.0},
     "horizon 12": {**FALL, "horizon": 12},
     "risk 0.9": {**FALL, "risk_discount": 0.9, "risk_threshold": 0.3},
-    "horizon 12, penalty": {**FALL, "horizon": 12, "alpha": 0.0, "penalty": 1.0},
     "horizon 12, penalty, guided": {**FALL, "horizon": 12, "penalty": 1.0},
     "risk 0.9, penalty, guided": {**FALL, "risk_discount": 0.9, "risk_threshold": 0.3, "penalty": 1.0},
 }

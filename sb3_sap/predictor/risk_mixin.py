@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_sap.common.arrays import FloatArray, Observations
@@ -137,6 +138,20 @@ class LearnedRiskMixin(PriorKnowledgeMixin):
     def risk_network(self) -> PermissibilityPredictor | None:
         """The network of `risk_target`, under a name that SB3 can save it by."""
         return None if self.risk_target is None else self.risk_target.network
+
+    def set_parameters(
+        self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        if not isinstance(load_path_or_dict, dict):
+            _, load_path_or_dict, _ = load_from_zip_file(load_path_or_dict, device=device, load_data=False)
+        held = "risk_network" in load_path_or_dict
+        if exact_match and "predictor" in load_path_or_dict and held != (self.risk_discount is not None):
+            # Not a ValueError, for the reason that the method it extends gives.
+            raise TypeError(
+                f"These parameters were saved {'with' if held else 'without'} `risk_discount`, but this model has "
+                f"{self.risk_discount!r}: leave `risk_discount` as it was saved, or build a new {type(self).__name__}."
+            )
+        super().set_parameters(load_path_or_dict, exact_match, device)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -216,6 +216,15 @@ def test_loaded_model_goes_on_as_if_it_had_not_been_saved(tmp_path):
         th.testing.assert_close(value, loaded.risk_network.state_dict()[name], rtol=0, atol=0)
 
 
+def test_file_without_a_risk_fits_no_model_with_one(tmp_path):
+    untrained(SACAP, Chain(), risk_discount=None).save(tmp_path / "without")
+    untrained(SACAP, Chain()).save(tmp_path / "with")
+    with pytest.raises(TypeError, match=r"^These parameters were saved without `risk_discount`, .* has 0.5: leave"):
+        SACAP.load(tmp_path / "without", risk_discount=0.5)
+    with pytest.raises(TypeError, match=r"^These parameters were saved with `risk_discount`, .* has None: leave"):
+        SACAP.load(tmp_path / "with", risk_discount=None)
+
+
 def test_file_of_the_predictor_knows_its_threshold(tmp_path):
     model = untrained(SACAP, Chain(), risk_threshold=0.4).learn(60)
     model.save_predictor(tmp_path / "e")

@@ -34,7 +34,6 @@ HIGHWAY: dict[str, dict[str, Any]] = {
     "AP function": {},
     "horizon 5": {"ap_function": None, **FALL, "horizon": 5},
     "horizon 10": {"ap_function": None, **FALL, "horizon": 10},
-    "risk 0.9": {"ap_function": None, **FALL, "risk_discount": 0.9, "risk_threshold": 0.5},  # seven steps
 }
 
 
@@ -77,10 +76,11 @@ def main() -> None:
     parser.add_argument("task", choices=["cart-pole", "highway"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[100, 101, 102])
     parser.add_argument("--steps", type=int, default=6_000)
+    parser.add_argument("--ways", nargs="+", choices=[*CART_POLE, *HIGHWAY], help="of labelling; by default all")
     options = parser.parse_args()
     th.set_num_threads(1)
     print("labels | seed | mean return | episodes | mistakes | accuracy of E", flush=True)
-    for way in CART_POLE if options.task == "cart-pole" else HIGHWAY:
+    for way in options.ways or (CART_POLE if options.task == "cart-pole" else HIGHWAY):
         for seed in options.seeds:
             print(run(options.task, way, seed, options.steps), flush=True)
 

@@ -75,7 +75,8 @@ class PermissibilityCallback(BaseCallback):
     def fit(self) -> None:
         """One pass over a balanced D_E of ``dataset_size`` examples."""
         examples, weights = self.model.draw_examples()
-        self.logger.record_mean("sap/predictor_loss", self.model.predictor.fit(examples, weights))
+        weighing = () if weights is None else (weights,)
+        self.logger.record_mean("sap/predictor_loss", self.model.predictor.fit(examples, *weighing))
         self.model.after_fit()
 
     def validate(self) -> None:

@@ -16,7 +16,7 @@ from sb3_sap.algorithms import (
 )
 from sb3_sap.check.check import check_permissibility
 from sb3_sap.check.report import PermissibilityReport
-from sb3_sap.common.extractors import RescaleExtractor, WithoutMaskExtractor
+from sb3_sap.common.extractors import GoalGapExtractor, RescaleExtractor, WithoutMaskExtractor
 from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.mask_wrapper import ActionMaskObservation
@@ -68,6 +68,7 @@ __all__ = [
     "ActionPermissibilityMixin",
     "ConstrainedExplorationMixin",
     "CrossQAP",
+    "GoalGapExtractor",
     "GuidedPolicy",
     "KnowledgeBuffer",
     "KnowledgeMixin",

@@ -91,6 +91,13 @@ def robotics():
     assert fetch_reach(obs, env.action_space.sample()[None], next_obs).shape == (1,)
 
 
+def minigrid():
+    """A task of MiniGrid can be made, and labels its actions."""
+    env = gym.make("sap/MiniGrid-v0", task="Empty-5x5")
+    env.reset(seed=0)
+    assert [env.step(action)[4]["permissible"] for action in (0, 2)] == [True, False]
+
+
 def commands():
     """The commands that each extra is for, as a user types them."""
     lane = ["--algo", "ddpg_ap", "--env", LANE, "-n", str(STEPS)]
@@ -139,7 +146,7 @@ if __name__ == "__main__":
     versions()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        for check in (algorithms, on_policy, robotics, commands, cluster, tools):
+        for check in (algorithms, on_policy, robotics, minigrid, commands, cluster, tools):
             print(f"\n== {check.__doc__}", flush=True)
             begin = time.monotonic()
             check()

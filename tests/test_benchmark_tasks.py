@@ -7,7 +7,7 @@ import yaml
 
 from sb3_sap.benchmark import dispatch
 from sb3_sap.benchmark.configurations import parse_configuration, parse_configurations
-from sb3_sap.benchmark.episodes import RETURN_COLUMNS, evaluation
+from sb3_sap.benchmark.episodes import RETURN_COLUMNS, evaluation, of_whole_action
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
 from sb3_sap.benchmark.reports.results import collect
 from sb3_sap.benchmark.reports.returns import mean_returns, steps_to_return
@@ -64,6 +64,15 @@ def test_every_configuration_of_a_task_trains_in_the_same_environment():
     options = {str(run(text, "highway-fast-v0").training) for text in ("sac_ap:task", "sac:task", "sac")}
     assert len(options) == 1
     assert "Kinematics" in options.pop()
+
+
+def test_labels_of_parts_are_one_label_in_an_evaluation():
+    gap = {"desired_goal": np.zeros((2, 3)), "achieved_goal": np.array([[0.2, 0.2, 0.0], [0.2, 0.0, 0.0]])}
+    nearer = {**gap, "achieved_goal": np.array([[0.1, 0.1, 0.0], [0.1, 0.1, 0.0]])}
+    label = of_whole_action("sb3_sap.tasks.fetch_reach_axes")
+    assert label(gap, np.zeros((2, 4)), nearer).tolist() == [True, False]
+    assert label.__name__ == "fetch_reach_axes"
+    assert of_whole_action("sb3_sap.tasks.fetch_reach")(gap, np.zeros((2, 4)), nearer).tolist() == [True, True]
 
 
 def test_a_configuration_may_have_fewer_seeds():

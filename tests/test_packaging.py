@@ -39,6 +39,13 @@ PROGRAMS = {
     "dask": "import distributed, sb3_sap.benchmark.dispatch",
     "docs": "import furo, myst_parser, sphinx.application",
     "hub": "import huggingface_sb3, sb3_sap.cli.hub",
+    "minigrid": """
+        import gymnasium as gym
+
+        env = gym.make("sap/MiniGrid-v0")
+        env.reset(seed=0)
+        assert "permissible" in env.step(0)[4]
+    """,
     "robotics": """
         from sb3_sap.evaluation import make_env
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -27,7 +28,7 @@ def evaluation(
     :return: a function of a policy and a checkpoint, which returns rows of ``RETURN_COLUMNS`` without the checkpoint
     """
     name = entry(algo, env_id).get("ap_function")
-    ap_function = None if name is None else resolve(name, "ap_function")
+    ap_function = None if name is None else of_whole_action(name)
     envs = [make_env(env_id, **options) for _ in seeds]
 
     def evaluate(policy: Any, checkpoint: int = 0) -> list[list[Any]]:
@@ -41,6 +42,18 @@ def evaluation(
         return [[seed, *episode.row(ap_function)] for seed, episode in zip(seeds, episodes, strict=True)]
 
     return evaluate
+
+
+def of_whole_action(name: str) -> APFunction:
+    """The AP function of a dotted name, as one label for each action where it has labels of parts."""
+    ap_function: APFunction = resolve(name, "ap_function")
+
+    @functools.wraps(ap_function)
+    def whole(obs: Any, actions: Any, next_obs: Any) -> Any:
+        labels = np.asarray(ap_function(obs, actions, next_obs))
+        return labels.all(axis=1) if labels.ndim > 1 else labels
+
+    return whole
 
 
 class Episode:

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_sap.benchmark.episodes import Episode
-from sb3_sap.common.functions import resolve
+from sb3_sap.benchmark.episodes import Episode, of_whole_action
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.permissibility import APFunction, query_labels
 
@@ -31,7 +30,7 @@ def oracle_episodes(env_id: str, name: str, options: dict[str, Any], seeds: list
     :param seed: of the random actions
     :return: rows of ``RETURN_COLUMNS`` without the checkpoint
     """
-    ap_function: APFunction = resolve(name, "ap_function")
+    ap_function = of_whole_action(name)
     rng = np.random.default_rng(seed)
     rows = []
     for number in seeds:

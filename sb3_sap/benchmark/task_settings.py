@@ -28,7 +28,15 @@ LONGER = 10
 #: Number of seeds of such a baseline.
 FEWER = 3
 #: Mean returns that count as a task's goal where the environment names none, or one that takes long to reach.
-GOALS = {"Pendulum-v1": -200.0, "Acrobot-v1": -100.0, "MountainCarContinuous-v0": 90.0, "MountainCar-v0": -110.0}
+GOALS = {
+    "Pendulum-v1": -200.0,
+    "Acrobot-v1": -100.0,
+    "MountainCarContinuous-v0": 90.0,
+    "MountainCar-v0": -110.0,
+    "FetchReach-v4": -3.0,
+    "racetrack-v0": 100.0,
+    "sap/MiniGrid-v0": 0.9,
+}
 #: The constant reward penalty that did best in a screening on design seeds.
 TUNED_PENALTIES = {"MountainCarContinuous-v0": 0.25, "Pendulum-v1": 0.5, "MountainCar-v0": 1.0, "Acrobot-v1": 1.0}
 #: Presets that are not for lane keeping alone.
@@ -42,6 +50,8 @@ GUIDANCE = (
     "action_parts",
     "event",
     "horizon",
+    "risk_discount",
+    "risk_threshold",
     "potential",
     "constraint",
     "permissible_actions",

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 
+from sb3_sap.common.errors import is_number
 from sb3_sap.common.functions import resolve
 
 
@@ -46,6 +47,37 @@ class RescaleExtractor(FlattenExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return super().forward((observations - self.shift) / self.scale)
+
+
+class GoalGapExtractor(BaseFeaturesExtractor):
+    """Reads an observation with a goal as the gap from what is achieved to what is desired.
+
+    Positions in metres of which a few centimetres matter are read badly, and their small difference worse.
+
+    :param observation_space: a ``Dict`` with "achieved_goal", "desired_goal" and "observation", arrays of numbers
+    :param unit: of the gap, for example the distance that counts as success
+    :param entries: which entries of "observation" are kept beside the gap, in the same unit, such as velocities;
+        ``None``: none
+    """
+
+    def __init__(self, observation_space: spaces.Dict, unit: float = 1.0, entries: Sequence[int] | None = None):
+        keys = ("observation", "achieved_goal", "desired_goal")
+        if not isinstance(observation_space, spaces.Dict) or not set(keys) <= set(observation_space.spaces):
+            raise ValueError(
+                f"GoalGapExtractor needs a Dict observation with {', '.join(keys)}, but the observation space is "
+                f"{observation_space}: leave `features_extractor_class` out."
+            )
+        if not (is_number(unit) and unit > 0):
+            raise ValueError(f"`unit` of GoalGapExtractor must be a number above 0, but is {unit!r}.")
+        self.entries = list(entries or [])
+        super().__init__(
+            observation_space, get_flattened_obs_dim(observation_space["achieved_goal"]) + len(self.entries)
+        )
+        self.unit = unit
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        gap = observations["desired_goal"] - observations["achieved_goal"]
+        return th.cat([gap, observations["observation"][:, self.entries]], dim=1) / self.unit
 
 
 class WithoutMaskExtractor(CombinedExtractor):

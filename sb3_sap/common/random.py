@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-Stream = Literal["exploration", "knowledge", "predictor", "prior"]
-_STREAMS: tuple[Stream, ...] = ("exploration", "knowledge", "predictor", "prior")
+Stream = Literal["exploration", "knowledge", "predictor", "prior", "risk"]
+_STREAMS: tuple[Stream, ...] = ("exploration", "knowledge", "predictor", "prior", "risk")
 
 
 def make_rng(seed: int | None, stream: Stream) -> np.random.Generator:

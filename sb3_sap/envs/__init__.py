@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
+import gymnasium as gym
 from gymnasium.envs.registration import register
 
 from sb3_sap.envs.car import CarState, Simulator
@@ -94,6 +96,20 @@ def make_torcs_driving(
     return DrivingEnv(simulator, laps=laps, random_start=random_start, render_mode=render_mode)
 
 
+def make_grid(task: str = "DoorKey-5x5", render_mode: str | None = None) -> gym.Env[Any, Any]:
+    """Make a task of MiniGrid with labels: what ``gym.make("sap/MiniGrid-v0", …)`` calls.
+
+    :param task: the name of the task between "MiniGrid-" and "-v0"
+    :param render_mode: None, "rgb_array" or "human"
+    :raise ModuleNotFoundError: if minigrid is not installed
+    """
+    import minigrid  # noqa: F401  # registers its tasks
+
+    from sb3_sap.envs.grid import LabelledGrid
+
+    return LabelledGrid(gym.make(f"MiniGrid-{task}-v0", render_mode=render_mode))
+
+
 for _name, _maker in {
     "sap/LaneKeeping-v0": make_lane_keeping,
     "sap/TorcsLaneKeeping-v0": make_torcs_lane_keeping,
@@ -101,6 +117,9 @@ for _name, _maker in {
 }.items():
     _maker.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make reads the render modes from it
     register(_name, f"{__name__}:{_maker.__name__}", max_episode_steps=MAX_EPISODE_STEPS)
+# A task of MiniGrid ends its own episodes.
+make_grid.metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # type: ignore[attr-defined]
+register("sap/MiniGrid-v0", f"{__name__}:make_grid")
 # That of Gymnasium's Taxi.
 register("sap/Taxi-v0", f"{__name__}.taxi:DecodedTaxi", max_episode_steps=200)
 
@@ -114,6 +133,7 @@ __all__ = [
     "constraint_ce1",
     "constraint_ce2",
     "get_track",
+    "make_grid",
     "make_lane_keeping",
     "make_torcs_driving",
     "make_torcs_lane_keeping",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import torch as th
 
 from sb3_sap.guidance.action_filter import guided_prediction
+from sb3_sap.guidance.masked_values import masked_outputs, values_network
+from sb3_sap.guidance.masks import PermissibleActions, masks_at
 from sb3_sap.guidance.permissibility_loss import PermissibilityLossMixin
 
 
@@ -20,6 +23,7 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
         AuxiliaryLossMixin           the same with updates of its own
         GuidedExplorationMixin       Algorithm 1
         LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E
+        LearnedRiskMixin             E as a discounted probability of an event
         PriorKnowledgeMixin          transitions and predictors of elsewhere
         LearnedPredictorMixin        settings of K and E, saving of E
         WatchedEnvironmentMixin      raw last observations, warnings about the training environment
@@ -38,6 +42,7 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
     :class:`~sb3_sap.guidance.permissibility_loss.PermissibilityLossMixin`,
     :class:`~sb3_sap.guidance.auxiliary_update.AuxiliaryLossMixin`,
     :class:`~sb3_sap.predictor.mixin.LearnedPermissibilityMixin`,
+    :class:`~sb3_sap.predictor.risk_mixin.LearnedRiskMixin`,
     :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin`,
     :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin`,
     :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`,
@@ -60,3 +65,13 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
         """
         actions, state = super().predict(observation, state, episode_start, deterministic)
         return (guided_prediction(self, observation, actions) if guided else actions), state
+
+    def proposed_actions(self, obs: Any) -> th.Tensor:
+        """(n, action_dim) scaled actions of the current policy in n observations, the best allowed ones where discrete
+        actions are masked.
+        """
+        if not self._masks_values:
+            return super().proposed_actions(obs)
+        mask = masks_at(self, cast(PermissibleActions, self._permissible_actions), obs)
+        with masked_outputs(values_network(self), lambda: mask):
+            return super().proposed_actions(obs)

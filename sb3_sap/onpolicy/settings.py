@@ -65,6 +65,11 @@ class OnPolicySettingsMixin(PriorKnowledgeMixin, SavingMixin, OnPolicyAlgorithm)
         permissible_actions: PermissibleActions | str | None = None,
         **kwargs: Any,
     ):
+        if kwargs.get("risk_discount") is not None:
+            raise ValueError(
+                f"`risk_discount` is for off-policy algorithms, and {type(self).__name__} learns from its last rollout "
+                "alone: give the `event` a `horizon` instead."
+            )
         self.alpha = alpha
         self.n_candidates = n_candidates
         self.predictor_epochs = predictor_epochs

@@ -21,6 +21,7 @@ from sb3_sap.predictor.events import Event
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import take_in
 from sb3_sap.predictor.pending import Pending
+from sb3_sap.predictor.risk import RiskKnowledge
 
 
 class KnowledgeMixin(ReplayBuffer):
@@ -235,6 +236,12 @@ def check_fits(loaded: ReplayBuffer, model: Any) -> None:
         raise ValueError(
             f"The file holds labels of the parts {loaded.knowledge.part_names}, but this model has "
             f"{own.knowledge.part_names}: build the model with the `action_parts` of the buffer."
+        )
+    if type(loaded.knowledge) is not type(own.knowledge):
+        has = {True: "has", False: "has not"}[isinstance(loaded.knowledge, RiskKnowledge)]
+        raise ValueError(
+            f"The file's knowledge buffer {has} what followed each action, which `risk_discount` needs: load the model "
+            "with the `risk_discount` that the buffer was filled with."
         )
     for name in ("observation_space", "action_space"):
         if getattr(loaded, name) != getattr(model, name):

@@ -18,6 +18,7 @@ from sb3_sap.predictor.knowledge import KnowledgeBuffer, PriorKnowledge
 from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.optimizer_state import settings_of
 from sb3_sap.predictor.parted import PartedKnowledge, PartedPriorKnowledge
+from sb3_sap.predictor.risk import RiskKnowledge
 
 #: Arguments whose defaults are the policy's, so that E extracts features from observations as the policy does.
 SHARED = ("features_extractor_class", "features_extractor_kwargs", "normalize_images")
@@ -49,6 +50,8 @@ def make_predictor(
     if "features_extractor_class" in own:  # the arguments of the policy's extractor would not fit it
         own = {"features_extractor_kwargs": {}, **own}
     of_parts = {} if model.action_parts is None else {"action_parts": model.parts.as_dict()}
+    if getattr(model, "risk_discount", None) is not None:
+        own = {**own, "threshold": 1.0 - model.risk_threshold}
     arguments = {name: getattr(model.policy, name) for name in SHARED} | own | of_parts
     known = inspect.signature(PermissibilityPredictor).parameters
     if given is not None:
@@ -100,8 +103,11 @@ def make_knowledge(model: Any, prior: bool = False) -> KnowledgeBuffer:
     knowledge: KnowledgeBuffer
     if model.parts:
         knowledge = (PartedPriorKnowledge if prior else PartedKnowledge)(model.parts.names, *settings)
+    elif prior:
+        knowledge = PriorKnowledge(*settings)
     else:
-        knowledge = (PriorKnowledge if prior else KnowledgeBuffer)(*settings)
+        at_risk = getattr(model, "risk_discount", None) is not None
+        knowledge = (RiskKnowledge if at_risk else KnowledgeBuffer)(*settings)
     room = knowledge.parts["train"].capacity // 2
     if model.min_per_class > room:
         raise ValueError(

@@ -74,9 +74,10 @@ class PermissibilityCallback(BaseCallback):
 
     def fit(self) -> None:
         """One pass over a balanced D_E of ``dataset_size`` examples."""
-        model = self.model
-        loss = model.predictor.fit(self.knowledge.sample(model.dataset_size, env=model.get_vec_normalize_env()))
-        self.logger.record_mean("sap/predictor_loss", loss)
+        examples, weights = self.model.draw_examples()
+        weighing = () if weights is None else (weights,)
+        self.logger.record_mean("sap/predictor_loss", self.model.predictor.fit(examples, *weighing))
+        self.model.after_fit()
 
     def validate(self) -> None:
         """Measures E on ``validation_size`` held-out examples; the gate of α depends on the result."""

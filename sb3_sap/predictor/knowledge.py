@@ -105,17 +105,16 @@ class KnowledgeBuffer:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        filled = self._filled()
+        self.observations = {key: self._whole(rows) for key, rows in self.observations.items()}
+        self.actions = self._whole(self.actions)
 
-        def whole(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-            if len(rows) == self.size:  # every row is filled, or an earlier version wrote all rows
-                return rows
-            store = np.zeros((self.size, *rows.shape[1:]), rows.dtype)
-            store[filled] = rows
-            return store
-
-        self.observations = {key: whole(rows) for key, rows in self.observations.items()}
-        self.actions = whole(self.actions)
+    def _whole(self, rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """An array of all rows, of which the filled ones are given."""
+        if len(rows) == self.size:  # every row is filled, or an earlier version wrote all rows
+            return rows
+        store = np.zeros((self.size, *rows.shape[1:]), rows.dtype)
+        store[self._filled()] = rows
+        return store
 
     def save(self, path: str | Path) -> None:
         """Writes K as SB3 writes a replay buffer, with pickle; only its filled rows take space."""
@@ -144,23 +143,26 @@ class KnowledgeBuffer:
         non_permissible, permissible = self.parts[part].counts
         return non_permissible, permissible
 
-    def add(self, obs: Observations, actions: np.ndarray[Any, Any], labels: np.ndarray[Any, Any]) -> None:
+    def add(self, obs: Observations, actions: np.ndarray[Any, Any], labels: np.ndarray[Any, Any]) -> Any:
         """Adds n labelled actions.
 
         :param obs: (n, *obs_shape), raw
         :param actions: (n, action_dim), scaled
         :param labels: (n,) bool
+        :return: (n,) the rows that they took, of which a later one may have taken an earlier one's
         """
         if self.newest is not None:
             self.newest.append((copy_observation(obs), actions.copy(), labels))
         keyed = obs if isinstance(obs, dict) else {"": obs}
+        slots = np.zeros(len(labels), dtype=np.int64)
         for i, label in enumerate(labels):
             part: Part = "validation" if self.rng.random() < self.validation_fraction else "train"
-            slot = self._offset[part] + self.parts[part].claim(int(label))
+            slots[i] = slot = self._offset[part] + self.parts[part].claim(int(label))
             for key, store in self.observations.items():
                 store[slot] = keyed[key][i]
             self.actions[slot] = actions[i]
             self.seen[int(label)] += 1
+        return slots
 
     def holds(self, part: Part, n: int) -> bool:
         """Whether a part, or that of `prior`, has n tuples of each class."""
@@ -223,6 +225,10 @@ class KnowledgeBuffer:
         self, n: int, part: Part = "train", env: VecNormalize | None = None, balanced: bool = True
     ) -> LabelledActions:
         """The same without `prior`."""
+        return self._labelled(part, *self._draw(n, part, balanced), env)
+
+    def _draw(self, n: int, part: Part, balanced: bool = True) -> tuple[Any, FloatArray]:
+        """Rows of a part, counted from its first, and their labels."""
         n_permissible = n // 2
         if not balanced:
             n_permissible = int(self.rng.binomial(2 * (n // 2), self.counts(part)[PERMISSIBLE] / len(self.parts[part])))
@@ -230,7 +236,7 @@ class KnowledgeBuffer:
         chosen = [self.rng.choice(self.parts[part].slots(label), k) for label, k in enumerate(sizes) if k > 0]
         labels = np.repeat(np.array(CLASSES, dtype=np.float32), sizes)
         order = self.rng.permutation(len(labels))
-        return self._labelled(part, np.concatenate(chosen)[order], labels[order], env)
+        return np.concatenate(chosen)[order], labels[order]
 
     def sample_class(
         self, label: int, n: int, part: Part = "train", env: VecNormalize | None = None

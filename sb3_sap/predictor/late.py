@@ -13,6 +13,7 @@ from sb3_sap.common.vec_envs import environment_layout
 from sb3_sap.permissibility import query_labels
 from sb3_sap.predictor.events import happened
 from sb3_sap.predictor.pending import Pending
+from sb3_sap.predictor.risk import RiskKnowledge
 
 if TYPE_CHECKING:
     from sb3_sap.predictor.labelling import Labels
@@ -91,5 +92,12 @@ def late_labels(
             after,
             parts=holder.knowledge.part_names,
         )
-    holder.knowledge.add(first, actions.reshape(len(due), -1), labels)
-    return LateLabels(envs, np.array([one.age for one in due]), labels)
+    ages = np.array([one.age for one in due])
+    flat = actions.reshape(len(due), -1)
+    if isinstance(holder.knowledge, RiskKnowledge):
+        followed = stack_observations([one.step.next_obs for one in due])
+        newest = ages == 0  # of the others the next step is there, so that nothing happened at their own
+        holder.knowledge.add_steps(first, flat, labels, followed, event[envs] & newest, terminal[envs] & newest)
+    else:
+        holder.knowledge.add(first, flat, labels)
+    return LateLabels(envs, ages, labels)

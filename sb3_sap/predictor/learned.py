@@ -11,6 +11,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.common.action_parts import ActionParts
+from sb3_sap.common.arrays import FloatArray
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.reward_shaping import Potential, RewardShaping
@@ -18,7 +19,7 @@ from sb3_sap.common.watching import WatchedEnvironmentMixin
 from sb3_sap.permissibility import APFunction, does_not_lower
 from sb3_sap.predictor.building import make_predictor
 from sb3_sap.predictor.events import Event, event_source
-from sb3_sap.predictor.knowledge import KnowledgeBuffer
+from sb3_sap.predictor.knowledge import KnowledgeBuffer, LabelledActions
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.network import SUFFICIENT_ACCURACY, PermissibilityPredictor
 from sb3_sap.predictor.optimizer_state import check_same_optimizer, settings_of
@@ -138,13 +139,18 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         holder.event = None if self.event is None else event_source(self.event)
         if self.event is None and self.horizon == 1:
             holder.pending = None
-        elif holder.pending is None or holder.pending.horizon != self.horizon:
-            holder.pending = Pending(self.horizon)
+        elif holder.pending is None or holder.pending.horizon != self.label_horizon:
+            holder.pending = Pending(self.label_horizon)
         holder.ap_function = own if self.ap_function is None else resolve(self.ap_function, "ap_function")
         holder.shaping = RewardShaping(self.penalty, potential, self.gamma)  # type: ignore[attr-defined]
         holder.images = self.images
         # With `permissible_actions` a model may do without labels of executed actions, but a penalty needs them.
         holder.needs_labels = holder.shaping.penalises or getattr(self, "permissible_actions", None) is None
+
+    @property
+    def label_horizon(self) -> int:
+        """The number of steps, its own included, over which an action is labelled."""
+        return self.horizon
 
     def _check_label_source(self) -> None:
         check_at_least(self, horizon=1)
@@ -189,6 +195,13 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         if self.parts:
             return bool(self.predictor.trusted.any())
         return self.validation_accuracy >= SUFFICIENT_ACCURACY
+
+    def draw_examples(self) -> tuple[LabelledActions, FloatArray | None]:
+        """What E is fitted to next, and the weight of each example; ``None``: all weigh the same."""
+        return self.knowledge.sample(self.dataset_size, env=self.get_vec_normalize_env()), None
+
+    def after_fit(self) -> None:
+        """Called after each fit of E."""
 
     # ---------------------------------------------------------------- saving
 

@@ -31,13 +31,13 @@ def measure(predictor: PermissibilityPredictor, sample: LabelledActions, epochs:
     obs: Any = obs_as_tensor(sample.observations, predictor.device)
     if predictor.parts:
         predictor.recall(sample)  # notes how accurate each part is
-    logits = predictor.part_logits(predictor.features(obs), actions)
+    logits = predictor.raw_logits(predictor.features(obs), actions)
     labels = labels.reshape(logits.shape)
     known = ~labels.isnan()
     logits, labels = logits[known], labels[known]
     loss = F.binary_cross_entropy_with_logits(logits, labels).item()
     probability, permissible = th.sigmoid(logits).cpu().numpy(), (labels > 0.5).cpu().numpy()
-    right = (probability > 0.5) == permissible
+    right = (logits.cpu().numpy() > predictor.offset) == permissible
     of_permissible, of_mistakes = (float(right[chosen].mean()) for chosen in (permissible, ~permissible))
     bins = np.minimum((probability * BINS).astype(int), BINS - 1)
     error = sum(

@@ -17,16 +17,17 @@ from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permiss
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.prior_replay import PriorReplay
+from sb3_sap.predictor.risk_mixin import LearnedRiskMixin
 from sb3_sap.predictor.schedule import check_growth, due
-from sb3_sap.predictor.transfer import Into, PriorKnowledgeMixin
+from sb3_sap.predictor.transfer import Into
 from sb3_sap.transitions.sources import number_of_rows
 
 
-class LearnedPermissibilityMixin(PriorKnowledgeMixin, SettingsMixin):
+class LearnedPermissibilityMixin(LearnedRiskMixin, SettingsMixin):
     """Gives an SB3 off-policy algorithm a knowledge buffer K and an AP predictor E (section 4.2).
 
     Only trains the predictor; action selection and policy updates are those of the base algorithm.
-    The further parameters are those of :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin`.
+    The further parameters are those of :class:`~sb3_sap.predictor.risk_mixin.LearnedRiskMixin`.
 
     :param refit_growth: refit and validate E when the step count has grown by this fraction, because a few new
         examples change it less and less, while a fit costs the same; 0 (paper): every step, or as often as

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -20,6 +21,7 @@ from torch.nn import functional as F
 
 from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import FloatArray, Observations
+from sb3_sap.common.errors import is_number
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.common.vec_envs import policy_layout
 from sb3_sap.predictor.encoding import encoded_actions, own_inputs
@@ -53,6 +55,7 @@ class PermissibilityPredictor(BaseModel):
     :param features_extractor_kwargs: its arguments
     :param normalize_images: as in SB3's policies
     :param action_parts: names of parts of the action with their dimensions, which have labels of their own
+    :param threshold: probability, between 0 and 1, above which an action counts as permissible
     """
 
     features_extractor: BaseFeaturesExtractor
@@ -74,6 +77,7 @@ class PermissibilityPredictor(BaseModel):
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         action_parts: Mapping[str, Sequence[int]] | None = None,
+        threshold: float = 0.5,
     ):
         if isinstance(optimizer_class, str):
             found = getattr(th.optim, optimizer_class, None)
@@ -82,7 +86,7 @@ class PermissibilityPredictor(BaseModel):
                     f"`optimizer_class` = {optimizer_class!r} names no optimizer of torch.optim, such as 'Adam'."
                 )
             optimizer_class = found
-        _check_arguments(net_arch, batch_size, learning_rate)
+        _check_arguments(net_arch, batch_size, learning_rate, threshold)
         super().__init__(
             observation_space,
             action_space,
@@ -94,6 +98,8 @@ class PermissibilityPredictor(BaseModel):
         )
         self.batch_size = batch_size
         self.parts = ActionParts.of(action_parts, action_space)
+        #: What verdicts subtract from the logit of the probability, so that above zero means permissible.
+        self.offset = math.log(threshold / (1 - threshold))
         self._arguments = {
             "net_arch": list(net_arch),
             "activation_fn": activation_fn,
@@ -101,6 +107,7 @@ class PermissibilityPredictor(BaseModel):
             "weight_decay": weight_decay,
             "batch_size": batch_size,
             "action_parts": self.parts.as_dict(),
+            "threshold": threshold,
         }
         self.features_extractor = self.make_features_extractor()
         n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
@@ -165,7 +172,7 @@ class PermissibilityPredictor(BaseModel):
         with th.no_grad():
             tensor = th.as_tensor(scaled.reshape(len(scaled), -1), device=self.device)
             features = self.features(obs_as_tensor(policy_layout(obs, self.observation_space), self.device))
-            found = th.sigmoid(self.part_logits(features, tensor)).cpu().numpy()
+            found = th.sigmoid(self.raw_logits(features, tensor)).cpu().numpy()
         return found if self.parts else found[:, 0]
 
     @property
@@ -197,7 +204,13 @@ class PermissibilityPredictor(BaseModel):
         return of_parts.masked_fill(~self.trusted, th.inf).min(dim=1).values
 
     def part_logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """(n, k) logits that each of k parts of the action is permissible; without parts (n, 1)."""
+        """(n, k) logits that each of k parts of the action is permissible, less the threshold's; without parts
+        (n, 1).
+        """
+        return self.raw_logits(features, actions) - self.offset
+
+    def raw_logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """(n, k) logits of the probabilities themselves; without parts (n, 1)."""
         # A float64 action space brings float64 actions.
         encoded = encoded_actions(self.action_space, actions).to(features.dtype)
         if self.own_inputs is None:
@@ -227,33 +240,41 @@ class PermissibilityPredictor(BaseModel):
         """(n,) logits of n observations and (n, action_dim) scaled actions."""
         return self.logits(self.features(obs), actions)
 
-    def loss(self, obs: Any, actions: th.Tensor, labels: th.Tensor) -> th.Tensor:
-        """Binary cross-entropy of (n,) labels in {0, 1}, or of those that are known of (n, k); the optimizer adds the
+    def loss(self, obs: Any, actions: th.Tensor, labels: th.Tensor, weights: th.Tensor | None = None) -> th.Tensor:
+        """Binary cross-entropy of (n,) labels from 0 to 1, or of those that are known of (n, k); the optimizer adds the
         L2 term.
+
+        :param weights: (n,) how much each row counts; ``None``: all the same
         """
+        features = self.features(obs)
         if not self.parts:
-            return F.binary_cross_entropy_with_logits(self(obs, actions), labels)  # Eq. (7)
+            logits = self.raw_logits(features, actions).squeeze(1)
+            return F.binary_cross_entropy_with_logits(logits, labels, weights)  # Eq. (7)
         known = ~labels.isnan()
         if self.own_inputs is None:
-            found = self.part_logits(self.features(obs), actions)[known]
+            found = self.raw_logits(features, actions)[known]
         else:  # of each row the parts alone that it has labels of
             rows, numbers = known.nonzero(as_tuple=True)
             encoded = encoded_actions(self.action_space, actions).to(labels.dtype)
-            found = self._own_logits(self.features(obs)[rows], encoded[rows], numbers)
+            found = self._own_logits(features[rows], encoded[rows], numbers)
         return F.binary_cross_entropy_with_logits(found, labels[known])
 
     @flush_denormals()
-    def fit(self, dataset: LabelledActions) -> float:
+    def fit(self, dataset: LabelledActions, weights: FloatArray | None = None) -> float:
         """One pass of mini-batch gradient descent over D_E, whose rows are in random order.
 
+        :param weights: (n,) how much each row counts, where the action has no parts; ``None``: all the same
         :return: mean loss over the mini-batches
         """
         obs, actions, labels = self._to_tensors(dataset)
+        weighing = None if weights is None else th.as_tensor(weights, device=self.device)
         losses = []
         with self._training():
             for batch in self._batches(len(labels)):
                 obs_batch = {key: value[batch] for key, value in obs.items()} if isinstance(obs, dict) else obs[batch]
-                loss = self.loss(obs_batch, actions[batch], labels[batch])
+                loss = self.loss(
+                    obs_batch, actions[batch], labels[batch], None if weighing is None else weighing[batch]
+                )
                 self.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
                 self.optimizer.step()
@@ -306,7 +327,9 @@ class PermissibilityPredictor(BaseModel):
         return obs, actions, labels
 
 
-def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any) -> None:
+def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any, threshold: Any) -> None:
+    if not (is_number(threshold) and 0 < threshold < 1):
+        raise ValueError(f"`threshold` of the predictor must lie between 0 and 1, but is {threshold!r}.")
     if not isinstance(net_arch, (list, tuple)) or not all(isinstance(n, Integral) and int(n) > 0 for n in net_arch):
         raise ValueError(f"`net_arch` must be a list of the widths of hidden layers, but is {net_arch!r}.")
     if not (isinstance(batch_size, Integral) and int(batch_size) > 0):

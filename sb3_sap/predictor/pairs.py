@@ -84,4 +84,4 @@ class ManyActions:
             hidden = (F.linear(batch, of_features, self._first.bias)[:, None] + share).flatten(0, 1)
             for layer in others:
                 hidden = layer(hidden)
-            yield hidden
+            yield hidden - self.predictor.offset

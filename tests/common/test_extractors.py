@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from sb3_sap import DDPGAP, RescaleExtractor
+from sb3_sap import DDPGAP, GoalGapExtractor, RescaleExtractor
 from sb3_sap.tasks import mountain_car_continuous
 
 CAR = "MountainCarContinuous-v0"
@@ -69,3 +69,31 @@ def test_extractor_that_cannot_be_imported_is_refused():
     wrong = {"features_extractor_class": "sb3_sap.RescaleExtractr"}
     with pytest.raises(ValueError, match=r"^`features_extractor_class`: 'sb3_sap\.RescaleExtractr' cannot be imported"):
         DDPGAP("MlpPolicy", gym.make(CAR), ap_function=mountain_car_continuous, policy_kwargs=wrong)
+
+
+def goal_space():
+    box = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    return spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
+
+
+def test_goal_is_read_as_the_gap_in_units():
+    extractor = GoalGapExtractor(goal_space(), unit=0.5, entries=[2])
+    rows = {
+        "achieved_goal": [[1.0, 2.0, 3.0]],
+        "desired_goal": [[1.5, 2.0, 2.5]],
+        "observation": [[7.0, 8.0, 9.0]],
+    }
+    assert extractor({key: th.tensor(value) for key, value in rows.items()}).tolist() == [[1, 0, -1, 18]]
+    assert GoalGapExtractor(goal_space()).features_dim == 3
+
+
+@pytest.mark.parametrize(
+    ("space", "arguments", "sentence"),
+    [
+        (spaces.Box(-1, 1, (2,)), {}, "^GoalGapExtractor needs a Dict observation with observation, achieved_goal"),
+        (goal_space(), {"unit": 0}, "^`unit` of GoalGapExtractor must be a number above 0, but is 0"),
+    ],
+)
+def test_wrong_arguments_of_the_gap_get_one_sentence(space, arguments, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        GoalGapExtractor(space, **arguments)

@@ -416,3 +416,11 @@ class Unmasked(Masked):
 def test_bad_masks_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_actions_whose_risk_is_learned_are_among_the_allowed_ones():
+    model = model_of(DQNAP, vectorised(1), event="terminated", risk_discount=0.5, permissible_actions=allowed)
+    obs = np.concatenate([Masked().reset(seed=seed)[0][None] for seed in range(50)])
+    actions = model.proposed_actions(obs).numpy()[:, 0]
+    assert allowed(obs, actions).all()
+    assert len(set(actions.tolist())) > 1

@@ -16,6 +16,7 @@ from sb3_sap.envs.torcs.probe import survives
 from sb3_sap.envs.torcs.readings import CarReadings
 from sb3_sap.envs.torcs.road import Road
 from sb3_sap.envs.torcs.structures import PLACED, RUNNING, RaceStructure, SituationStructure
+from sb3_sap.envs.torcs.tick_loop import tick_loop
 from sb3_sap.envs.torcs.track_files import flatten
 
 #: One step of the physics, s.
@@ -82,12 +83,14 @@ class Physics(CarReadings):
         self._pool = pool(installation)
         self._car_handle = read_car(self._pool.shared, files)
         self._library: Any = self._pool.acquire()
+        self._run = tick_loop(self._library.update, TICK)
         self._running = False
         super().__init__(Road(self._library, track_file), self._pool.shared)
         self._make_structures()
 
     def _make_structures(self) -> None:
         self._situation: Any = SituationStructure()
+        self._situation_address = ctypes.addressof(self._situation)
         self._race: Any = RaceStructure()
         self._cars = (ctypes.c_void_p * 1)(ctypes.addressof(self.car))
         self._situation.n_cars = 1
@@ -95,7 +98,7 @@ class Physics(CarReadings):
         self._situation.max_damage = MAX_DAMAGE
         self._situation.cars = ctypes.addressof(self._cars)
         self._race.car_list = ctypes.addressof(self.car)
-        self._race.situation = ctypes.addressof(self._situation)
+        self._race.situation = self._situation_address
         self._race.track = ctypes.addressof(self.road.structure)
 
     def place(self, distance: float, track_pos: float = 0.0, angle: float = 0.0, height: float = DROP_HEIGHT) -> None:
@@ -148,9 +151,8 @@ class Physics(CarReadings):
         """Advances the physics by a number of ticks of 2 ms."""
         self._check_running()
         self._situation.race_state = race_state
-        update, situation = self._library.update, ctypes.addressof(self._situation)
-        for _ in range(ticks):
-            update(situation, TICK, -1)
+        if ticks > 0:
+            self._run(self._situation_address, ticks)
 
     def drive_everywhere(self) -> None:
         """Places the car at many places and drives a little, to see whether TORCS survives it."""

@@ -115,7 +115,7 @@ class Physics(CarReadings):
             self._library.shutdown()
         ctypes.memset(ctypes.addressof(self.car), 0, ctypes.sizeof(self.car))
         self.car.skill_level, self.car.car_handle = self._skill_level, self._car_handle
-        write_place(self.car, self.road, self._shared, distance, track_pos, angle, height)
+        write_place(self.car, self.road, self.shared, distance, track_pos, angle, height)
         self._situation.race_state, self._situation.current_time = PLACED, 0.0
         self._library.init(1, ctypes.addressof(self.road.structure), *self._factors)
         self._running = True

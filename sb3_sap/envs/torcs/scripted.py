@@ -59,7 +59,9 @@ class ScriptedDriver:
     ) -> tuple[NDArray[np.float32], None]:
         """Actions, (2,) or (n, 2), for observations, (30,) or (n, 30); the other arguments have no effect."""
         if observation.shape[-1:] != UNITS.shape:
-            raise ValueError(f"observation must be that of sap/TorcsRacing-v0, (30,), but has shape {observation.shape}.")
+            raise ValueError(
+                f"observation must be that of sap/TorcsRacing-v0, (30,), but has shape {observation.shape}."
+            )
         if observation.ndim == 1:
             return np.array(self._drive(observation), dtype=np.float32), None
         return np.array([self._drive(row) for row in observation], dtype=np.float32).reshape(-1, 2), None

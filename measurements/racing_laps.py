@@ -25,6 +25,14 @@ from sb3_sap.tasks import RACING_PARTS, racing
 #: Decelerations of the driver, m/s²: its default, and one with which it is faster.
 DECELERATIONS = (DECELERATION, 12.0)
 LAPS = 2
+#: Tables of the page, by their column of the data.
+TABLES = {
+    "lap_2_s": "The second lap, flying, s",
+    "lap_1_s": "The first lap, from rest, s",
+    "lap_1_kmh": "Its mean speed, km/h",
+    "steering_refused_pct": "Actions whose steering is refused, %",
+    "pedal_refused_pct": "Actions whose pedal is refused, %",
+}
 RANDOM_STEPS = 2_000
 
 
@@ -78,10 +86,17 @@ def main(out: Path) -> None:
         print(pd.DataFrame(rows).tail(4).to_string(header=len(rows) == 4), flush=True)
         write_csv(out, pd.DataFrame(rows))
     made = provenance()
-    table = pd.DataFrame(rows).astype(object).where(pd.DataFrame(rows).notna(), "")
-    text = "# The scripted driver of sap/TorcsRacing-v0\n\n" + markdown(table)
+    text = "# The scripted driver of sap/TorcsRacing-v0\n\n" + "\n".join(
+        f"{title}:\n\n{markdown(wide(pd.DataFrame(rows), column))}" for column, title in TABLES.items()
+    )
     text += f"\nMade by `python measurements/racing_laps.py` on {made['date']}, revision {made['revision']}.\n"
     write_text(out.with_suffix(".md"), text)
+
+
+def wide(table: pd.DataFrame, column: str) -> pd.DataFrame:
+    """A row for each driver, a column for each track; drivers without values are left out."""
+    values = table.pivot(index="driver", columns="track", values=column)[list(TRACKS)].dropna(how="all")
+    return values.map(lambda value: f"{value:.1f}").reset_index()
 
 
 if __name__ == "__main__":

@@ -125,7 +125,7 @@ def main(root: Path, out: Path) -> None:
             write_csv(out, pd.DataFrame(rows))
     table = pd.DataFrame(rows)
     pages = []
-    for number, title in ((1, "The first lap, from the grid at rest, s"), (2, "The second lap, flying, s")):
+    for number, title in ((2, "The second lap, flying, s"), (1, "The first lap, from the grid at rest, s")):
         wide = table[table["lap"] == number].pivot(index="robot", columns="track", values="time_s")[list(TRACKS)]
         shown = wide.map(lambda time: "not completed" if pd.isna(time) else f"{time:.1f}")
         pages.append(f"{title}:\n\n{markdown(shown.reset_index())}")

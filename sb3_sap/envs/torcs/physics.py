@@ -83,14 +83,14 @@ class Physics(CarReadings):
         self._pool = pool(installation)
         self._car_handle = read_car(self._pool.shared, files)
         self._library: Any = self._pool.acquire()
-        self._run = tick_loop(self._library.update, TICK)
         self._running = False
         super().__init__(Road(self._library, track_file), self._pool.shared)
         self._make_structures()
 
     def _make_structures(self) -> None:
         self._situation: Any = SituationStructure()
-        self._situation_address = ctypes.addressof(self._situation)
+        situation = ctypes.addressof(self._situation)
+        self._run = tick_loop(self._library.update, situation, TICK)
         self._race: Any = RaceStructure()
         self._cars = (ctypes.c_void_p * 1)(ctypes.addressof(self.car))
         self._situation.n_cars = 1
@@ -98,7 +98,7 @@ class Physics(CarReadings):
         self._situation.max_damage = MAX_DAMAGE
         self._situation.cars = ctypes.addressof(self._cars)
         self._race.car_list = ctypes.addressof(self.car)
-        self._race.situation = self._situation_address
+        self._race.situation = situation
         self._race.track = ctypes.addressof(self.road.structure)
 
     def place(self, distance: float, track_pos: float = 0.0, angle: float = 0.0, height: float = DROP_HEIGHT) -> None:
@@ -149,10 +149,11 @@ class Physics(CarReadings):
 
     def advance(self, ticks: int, race_state: int = RUNNING) -> None:
         """Advances the physics by a number of ticks of 2 ms."""
-        self._check_running()
+        if not self._running:
+            self._check_running()
         self._situation.race_state = race_state
         if ticks > 0:
-            self._run(self._situation_address, ticks)
+            self._run(ticks)
 
     def drive_everywhere(self) -> None:
         """Places the car at many places and drives a little, to see whether TORCS survives it."""

@@ -26,7 +26,7 @@ RANGE = 200.0
 #: Reading of all where the car is off the road, m.
 OFF_ROAD = -1.0
 #: Largest distance of an edge from the chords that stand for it, m.
-TOLERANCE = 0.01
+TOLERANCE = 0.02
 #: Length of the road that is followed, m along the centre line: more than the range, because rays may cut corners.
 REACH = 1.3 * RANGE
 
@@ -95,11 +95,13 @@ def _follow(
     :param clockwise: the edge that is seen turning clockwise, from ray ``low`` on, as the stations go by
     :param anticlockwise: the other edge, from ray ``high`` back
     """
-    i = stations[0]
-    a, b = clockwise[i] - car, anticlockwise[i] - car
-    for i in stations[1:]:
-        c, d = clockwise[i] - car, anticlockwise[i] - car
-        while (to := c * rays[low]).imag <= 0 < (since := a * rays[low]).imag:
+    # Slices rather than indices, and rays in variables: this is the innermost loop of every step.
+    ends = slice(stations.start, stations.stop if stations.stop >= 0 else None, stations.step)
+    left_behind, right_behind = clockwise[stations.start] - car, anticlockwise[stations.start] - car
+    low_ray, high_ray = rays[low], rays[high]
+    for one, other in zip(clockwise[ends], anticlockwise[ends], strict=True):
+        here, there = one - car, other - car
+        while (to := here * low_ray).imag <= 0 < (since := left_behind * low_ray).imag:
             metres = since.real + (to.real - since.real) * since.imag / (since.imag - to.imag)
             if metres <= 0:
                 break
@@ -107,7 +109,8 @@ def _follow(
             low += 1
             if low > high:
                 return
-        while (to := d * rays[high]).imag >= 0 > (since := b * rays[high]).imag:
+            low_ray = rays[low]
+        while (to := there * high_ray).imag >= 0 > (since := right_behind * high_ray).imag:
             metres = since.real + (to.real - since.real) * since.imag / (since.imag - to.imag)
             if metres <= 0:
                 break
@@ -115,7 +118,8 @@ def _follow(
             high -= 1
             if low > high:
                 return
-        a, b = c, d
+            high_ray = rays[high]
+        left_behind, right_behind = here, there
 
 
 def _stations(road: Road) -> list[float]:

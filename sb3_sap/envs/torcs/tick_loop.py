@@ -37,28 +37,35 @@ CODE = bytes.fromhex(
 #: Bytes of the memory that holds it: one page.
 PAGE = 4096
 
-Loop = Callable[[int, int], None]
+Loop = Callable[[int], None]
 
 
-def tick_loop(update: Any, tick: float, native: bool = True) -> Loop:
-    """A function of a situation's address and a number of ticks, at least 1, that advances the physics by them.
+def tick_loop(update: Any, situation: int, tick: float, native: bool = True) -> Loop:
+    """A function of a number of ticks, at least 1, that advances the physics by them.
 
     :param update: TORCS' SimUpdate, as ctypes loaded it
+    :param situation: address of the situation
     :param tick: s
     :param native: False: loop in Python
     """
     machine = _machine_code() if native else None
     if machine is None:
 
-        def python_loop(situation: int, ticks: int) -> None:
+        def python_loop(ticks: int) -> None:
             for _ in range(ticks):
                 update(situation, tick, -1)
 
         return python_loop
-    address = ctypes.cast(update, ctypes.c_void_p).value
+    # Converted once: converting the arguments takes as long as the call.
+    address = ctypes.c_void_p(ctypes.cast(update, ctypes.c_void_p).value)
+    pointer, seconds = ctypes.c_void_p(situation), ctypes.c_double(tick)
+    counts: dict[int, ctypes.c_long] = {}
 
-    def native_loop(situation: int, ticks: int) -> None:
-        machine(situation, ticks, address, tick)
+    def native_loop(ticks: int) -> None:
+        count = counts.get(ticks)
+        if count is None:
+            count = counts[ticks] = ctypes.c_long(ticks)
+        machine(pointer, count, address, seconds)
 
     return native_loop
 

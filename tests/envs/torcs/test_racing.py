@@ -1,6 +1,7 @@
 """sap/TorcsRacing-v0: sensors, reward and ends, and that a scripted driver laps every track by the observation."""
 
 import cmath
+import ctypes
 import math
 
 import gymnasium as gym
@@ -235,7 +236,8 @@ def test_native_ticks_are_those_of_python_to_the_bit(torcs):
     poses = []
     for native in (True, False):
         simulation = Physics("wheel-2")
-        simulation._run = tick_loop(simulation._library.update, TICK, native=native)
+        situation = ctypes.addressof(simulation._situation)
+        simulation._run = tick_loop(simulation._library.update, situation, TICK, native=native)
         simulation.place(100.0)
         for i in range(50):
             simulation.control(0.3 * math.sin(i), 0.7, gear=1)

@@ -15,7 +15,7 @@ from sb3_sap.envs.torcs.physics import TICK, Physics
 from sb3_sap.envs.torcs.range_finders import DIRECTIONS, OFF_ROAD, RANGE, RangeFinders
 from sb3_sap.envs.torcs.scripted import ScriptedDriver
 from sb3_sap.envs.torcs.sensors import INDEX, LIMITS, NAMES, TRACK, UNITS
-from sb3_sap.envs.torcs.tick_loop import tick_loop
+from sb3_sap.envs.torcs.tick_loop import _machine_code, tick_loop
 
 
 def make(**options):
@@ -229,6 +229,29 @@ def test_scripted_driver_predicts_batches_as_single_observations(torcs):
     assert driver.predict(np.array(rows))[0].tolist() == np.array(single).tolist()
 
 
+def test_same_seed_and_actions_give_the_same_bits(torcs):
+    runs = []
+    for _ in range(2):
+        env = make(track="eroad", random_start=True)
+        rng = np.random.default_rng(0)
+        rows = [env.reset(seed=3)[0]]
+        for _ in range(60):
+            obs, reward, terminated, *_ = env.step(rng.uniform([-0.2, 0.0], [0.2, 1.0]))
+            rows.append(np.append(obs, reward))
+            if terminated:
+                rows.append(env.reset()[0])
+        runs.append(np.concatenate(rows))
+        env.close()
+    assert runs[0].tobytes() == runs[1].tobytes()
+
+
+def test_car_can_be_drawn(torcs):
+    env = make(track="eroad", render_mode="rgb_array")
+    env.reset(seed=0)
+    assert env.render().shape == (400, 600, 3)
+    env.close()
+
+
 # ------------------------------------------------------------------ parts
 
 
@@ -245,6 +268,22 @@ def test_native_ticks_are_those_of_python_to_the_bit(torcs):
         poses.append((*simulation.pose, *simulation.velocity, *simulation.wheel_spins))
         simulation.close()
     assert poses[0] == poses[1]
+
+
+def test_python_loops_where_machine_code_is_forbidden(torcs, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError
+
+    monkeypatch.setattr("mmap.mmap", refuse)
+    _machine_code.cache_clear()
+    try:
+        simulation = Physics("wheel-2")
+        assert simulation._run.__name__ == "python_loop"
+        simulation.place(100.0)
+        simulation.close()
+    finally:
+        monkeypatch.undo()
+        _machine_code.cache_clear()
 
 
 class Car:

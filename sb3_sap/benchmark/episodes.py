@@ -26,7 +26,8 @@ def evaluation(
     :param seeds: one for each episode
     :return: a function of a policy and a checkpoint, which returns rows of ``RETURN_COLUMNS`` without the checkpoint
     """
-    name = entry(algo, env_id).get("ap_function")
+    own = entry(algo, env_id)
+    name, parts = own.get("ap_function"), tuple(own.get("action_parts", ()))
     ap_function = None if name is None else resolve(name, "ap_function")
     envs = [make_env(env_id, **options) for _ in seeds]
 
@@ -38,7 +39,7 @@ def evaluation(
             actions, _ = policy.predict(_stacked([episode.obs for episode in running]), deterministic=True)
             for episode, action in zip(running, actions, strict=True):
                 episode.step(action)
-        return [[seed, *episode.row(ap_function)] for seed, episode in zip(seeds, episodes, strict=True)]
+        return [[seed, *episode.row(ap_function, parts)] for seed, episode in zip(seeds, episodes, strict=True)]
 
     return evaluate
 
@@ -70,15 +71,17 @@ class Episode:
         self._actions.append(action)
         self._labels.append(self._info.get("permissible"))
 
-    def row(self, ap_function: APFunction | None) -> list[Any]:
+    def row(self, ap_function: APFunction | None, parts: tuple[str, ...] = ()) -> list[Any]:
         """Success if the environment reports it, share of permissible actions, return, return as score, steps.
 
         :param ap_function: labels the actions; None if the environment has labelled them
+        :param parts: of the action, which have labels of their own: it is permissible if all of them are
         """
         labels: Any = self._labels
         if ap_function is not None:
             before, after = _stacked(self._observations[:-1]), _stacked(self._observations[1:])
-            labels = query_labels(ap_function, "ap_function", before, np.stack(self._actions), after)
+            labels = query_labels(ap_function, "ap_function", before, np.stack(self._actions), after, parts=parts)
+            labels = labels.all(axis=1) if parts else labels
         success, total = self._info.get("is_success"), round(self._total, 4)
         permissible = round(float(np.mean(labels)), 4)
         return [None if success is None else bool(success), permissible, total, total, len(labels)]

@@ -22,6 +22,7 @@ def short(monkeypatch):
     monkeypatch.setattr(racing_demo, "TAUGHT", 50)
 
 
+@pytest.mark.slow
 def test_racing_demo_leaves_laps_and_their_picture(short, tmp_path):
     assert main(["demo", "--task", "racing", "--seed", "101", "--steps", "20", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {

@@ -40,7 +40,8 @@ class RacingEnv(gym.Env[Observation, Action]):
     ``info`` holds the raw readings: ``sensors``, by their SCR names, with lists for track and wheelSpinVel; angle
     (rad), track_pos, speed_x, speed_y, speed_z (km/h) and distance (m) as in lane keeping; damage (points); off_track;
     time (s, of the episode); ``covered``, the fraction driven of the laps; ``lap_times`` (s), of the completed ones,
-    interpolated within a step; lap_done: all are completed.
+    interpolated within a step; lap_done: all are completed, which is_success repeats for SB3's success
+    rate.
 
     :param track: name of a track that TORCS ships, or the path of a track file
     :param control_step: s between two actions, a multiple of 0.002
@@ -153,6 +154,7 @@ class RacingEnv(gym.Env[Observation, Action]):
         covered = max(clock.progress / ((self.laps or 1) * self.length), 0.0)
         if self.laps is not None:
             covered = min(covered, 1.0)
+        lap_done = covered >= 1 and not off_track
         return {
             "sensors": {
                 "angle": angle,
@@ -176,7 +178,8 @@ class RacingEnv(gym.Env[Observation, Action]):
             "covered": covered,
             "off_track": off_track,
             "lap_times": clock.lap_times,
-            "lap_done": covered >= 1 and not off_track,
+            "lap_done": lap_done,
+            "is_success": lap_done,
         }
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -16,7 +16,7 @@ from sb3_sap.envs.lane_keeping import RANDOM_ANGLE, RANDOM_TRACK_POS, check_laps
 from sb3_sap.envs.torcs.gearbox import Gearbox
 from sb3_sap.envs.torcs.lap_clock import LapClock
 from sb3_sap.envs.torcs.physics import Physics
-from sb3_sap.envs.torcs.sensors import LIMITS, TRACK, UNITS, Sensors, observation
+from sb3_sap.envs.torcs.sensors import LIMITS, MOTION, SPINS, TRACK, UNITS, Sensors, observation
 from sb3_sap.envs.torcs.simulator import check_start, start_place, step_ticks
 from sb3_sap.envs.torcs.throttle import PERIOD, PERIOD_TICKS
 from sb3_sap.envs.tracks import read_track_xml
@@ -148,8 +148,8 @@ class RacingEnv(gym.Env[Observation, Action]):
 
     def _info(self) -> dict[str, Any]:
         (raw, distance, damage), clock = self._reading, self._clock
-        angle, track, spins = raw[0], raw[TRACK], raw[24:28]
-        track_pos, speed_x, speed_y, speed_z = raw[20:24]
+        angle, track, spins = raw[0], raw[TRACK], raw[SPINS]
+        track_pos, speed_x, speed_y, speed_z = raw[MOTION]
         off_track = not abs(track_pos) <= 1
         covered = max(clock.progress / ((self.laps or 1) * self.length), 0.0)
         if self.laps is not None:
@@ -164,8 +164,8 @@ class RacingEnv(gym.Env[Observation, Action]):
                 "speedY": speed_y,
                 "speedZ": speed_z,
                 "wheelSpinVel": spins,
-                "rpm": raw[28],
-                "gear": raw[29],
+                "rpm": raw[-2],
+                "gear": raw[-1],
             },
             "angle": angle,
             "track_pos": track_pos,
@@ -192,7 +192,8 @@ class RacingEnv(gym.Env[Observation, Action]):
 
             self._viewer = Viewer(self.track, window=self.render_mode == "human")
         raw, distance, _ = self._reading
-        state = CarState(raw[0], raw[20], raw[21], raw[22], raw[23], distance)
+        track_pos, speed_x, speed_y, speed_z = raw[MOTION]
+        state = CarState(raw[0], track_pos, speed_x, speed_y, speed_z, distance)
         image: NDArray[np.uint8] = self._viewer.draw(state, self._steering)
         return image if self.render_mode == "rgb_array" else None
 

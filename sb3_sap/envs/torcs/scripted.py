@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sb3_sap.envs.car import STEERING_LOCK
 from sb3_sap.envs.torcs.range_finders import DIRECTIONS
-from sb3_sap.envs.torcs.sensors import INDEX, TRACK, UNITS
+from sb3_sap.envs.torcs.sensors import INDEX, SPINS, TRACK, UNITS
 from sb3_sap.envs.units import KMH
 
 #: Deceleration with which the car could stop within its view, m/s². The tyres would do more than twice that, but they
@@ -77,7 +77,7 @@ class ScriptedDriver:
         steering = GAIN * free / STEERING_LOCK / (1 + speed / HALF_SPEED) - DRIFT_GAIN * drift
         target = math.sqrt(2 * self.deceleration * max(view[longest] - MARGIN, 0.0))
         pedal = min(max(PEDAL_GAIN * (target - speed), -1.0), 1.0)
-        return min(max(steering, -1.0), 1.0), _without_slip(pedal, speed, raw[INDEX["wheelSpinVel[0]"] :][:4])
+        return min(max(steering, -1.0), 1.0), _without_slip(pedal, speed, raw[SPINS])
 
 
 def _without_slip(pedal: float, speed: float, spins: list[float]) -> float:

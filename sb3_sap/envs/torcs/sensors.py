@@ -5,6 +5,7 @@ Those of a car alone on the road are here; fuel, times and the opponents' are no
 
 from __future__ import annotations
 
+import ctypes
 import math
 import struct
 from typing import Any, NamedTuple
@@ -31,8 +32,10 @@ NAMES = (
 )
 #: Index of each name.
 INDEX = {name: i for i, name in enumerate(NAMES)}
-#: Slice of the range finders.
+#: Slices of the range finders; of trackPos and the three speeds; and of the wheels' spins.
 TRACK = slice(INDEX["track[0]"], INDEX["trackPos"])
+MOTION = slice(INDEX["trackPos"], INDEX["wheelSpinVel[0]"])
+SPINS = slice(INDEX["wheelSpinVel[0]"], INDEX["rpm"])
 #: Unit of each entry: rad; m; half widths; km/h; rad/s; 1/min; 1. An entry of the observation is the raw reading in
 #: its unit.
 UNITS = np.array([1.0, *(RANGE,) * 19, 1.0, 100.0, 100.0, 100.0, *(100.0,) * 4, 10_000.0, 6.0])
@@ -64,7 +67,7 @@ def _members() -> dict[int, str]:
         position + where.segment.offset: "Q",
         position + where.to_start.offset: "f",
         position + where.to_middle.offset: "f",
-        **{wheels + 88 * wheel + spin.spin.offset: "f" for wheel in range(4)},
+        **{wheels + ctypes.sizeof(spin) * wheel + spin.spin.offset: "f" for wheel in range(4)},
         members.gear.offset: "i",
         members.engine_speed.offset: "f",
         members.damage.offset: "i",

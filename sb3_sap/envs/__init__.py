@@ -105,15 +105,17 @@ def make_torcs_racing(
     start: str = "race",
     laps: int | None = 1,
     random_start: bool = False,
+    skill_level: int = 0,
     render_mode: str | None = None,
 ) -> RacingEnv:
     """Make `RacingEnv`: what ``gym.make("sap/TorcsRacing-v0", …)`` calls.
 
-    The parameters are those of `make_torcs_lane_keeping`.
+    The parameters are those of `make_torcs_lane_keeping`, and ``skill_level``, 0 (rookie) to 3 (pro): a rookie's tyres
+    hold best, and only a rookie's car takes no damage.
     """
     from sb3_sap.envs.torcs.racing import RacingEnv
 
-    return RacingEnv(track, control_step, car, start, laps, random_start, render_mode)
+    return RacingEnv(track, control_step, car, start, laps, random_start, skill_level, render_mode)
 
 
 for _name, _maker in {

@@ -49,6 +49,7 @@ class RacingEnv(gym.Env[Observation, Action]):
     :param start: "training", 100 m before the line, or "race", the engine's own grid; the car stands
     :param laps: laps to drive, or None to drive on
     :param random_start: start anywhere on the track, near the centre line; the car stands
+    :param skill_level: 0 (rookie) to 3 (pro): a rookie's tyres hold best, and only a rookie's car takes no damage
     :param render_mode: None, "rgb_array" or "human"
     :raise ValueError: for an invalid argument, a start that does not exist, or an action of NaN
     """
@@ -63,6 +64,7 @@ class RacingEnv(gym.Env[Observation, Action]):
         start: str = "race",
         laps: int | None = 1,
         random_start: bool = False,
+        skill_level: int = 0,
         render_mode: str | None = None,
     ) -> None:
         check_start(start)
@@ -75,7 +77,7 @@ class RacingEnv(gym.Env[Observation, Action]):
         self.random_start = random_start
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / control_step))}  # type: ignore[misc]
-        self.simulation = Physics(track, car)
+        self.simulation = Physics(track, car, skill_level, damage_factor=1.0)
         self.length = self.simulation.length
         self.track = read_track_xml(self.simulation.track_path)
         self.start = start_place(start, self.simulation.track_path, self.length)

@@ -180,6 +180,19 @@ def test_turning_round_ends_the_episode(torcs):
     assert not info["off_track"]
 
 
+def test_a_wall_damages_every_car_but_a_rookies(torcs):
+    damage = []
+    for level in (3, 0):
+        env = make_torcs_racing(track="eroad", skill_level=level)
+        env.reset(options={"distance": 500.0})
+        for _ in range(120):  # past the end of the episode, into the barrier
+            info = env.step(np.array([0.05, 1.0]))[-1]
+        damage.append(info["damage"])
+        env.close()
+    assert damage[0] > 0
+    assert damage[1] == 0
+
+
 def test_laps_are_counted_one_by_one(torcs):
     env = make(track="g-track-3", laps=2, control_step=0.2)
     _, info = lap(env, ScriptedDriver(8.0))
@@ -195,6 +208,7 @@ def test_laps_are_counted_one_by_one(torcs):
         ({"laps": 0}, "laps must be a positive whole number"),
         ({"control_step": 0.003}, "multiple of 0.002"),
         ({"car": "car1-trb9"}, "car must be one that TORCS ships"),
+        ({"skill_level": 4}, "skill_level must be from 0"),
         ({"render_mode": "ansi"}, "render_mode must be"),
     ],
 )

@@ -7,7 +7,7 @@ import yaml
 
 from sb3_sap.benchmark import dispatch
 from sb3_sap.benchmark.configurations import parse_configuration, parse_configurations
-from sb3_sap.benchmark.episodes import RETURN_COLUMNS, evaluation
+from sb3_sap.benchmark.episodes import RETURN_COLUMNS, Episode, evaluation
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
 from sb3_sap.benchmark.reports.results import collect
 from sb3_sap.benchmark.reports.returns import mean_returns, steps_to_return
@@ -40,6 +40,17 @@ class Policy:
 def rows_of(act, env_id=CAR, algo="ddpg_ap", episodes=("10000", "10001")):
     rows = evaluation(env_id, algo, {}, list(episodes))(Policy(act))
     return [dict(zip(RETURN_COLUMNS[1:], row, strict=True)) for row in rows]
+
+
+def test_an_action_is_permissible_if_all_of_its_parts_are():
+    episode = Episode(gym.make(CAR), 0)
+    for force in (-1.0, 0.5, 1.0, -0.5):
+        episode.step(np.array([force], dtype=np.float32))
+
+    def parts(obs, actions, next_obs):
+        return np.concatenate([actions > 0, actions > 0.7], axis=1)
+
+    assert episode.row(parts, ("right", "hard"))[1] == 0.25
 
 
 # ------------------------------------------------------------------ configurations and runs

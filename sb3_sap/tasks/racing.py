@@ -1,7 +1,7 @@
 """TORCS' race against the clock: steering and pedal are judged by themselves.
 
-Accelerations are those of the default car, which brakes with 24 m/s² at 60 km/h and with up to 38 at 180, and corners
-with 20 to 25 m/s² at 75 km/h.
+Accelerations are those of the default car, which brakes with 25 m/s² at 60 km/h and with 39 at 160, and corners with up
+to 30 from 80 km/h (``measurements/car_limits.py``).
 """
 
 from __future__ import annotations

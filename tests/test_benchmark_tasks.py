@@ -48,6 +48,8 @@ def rows_of(act, env_id=CAR, algo="ddpg_ap", episodes=("10000", "10001")):
 def test_a_task_compares_a_guided_algorithm_with_its_base_tuned_settings_and_the_oracle():
     assert task_configurations(CAR) == ["ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=200000,seeds=3]", "oracle"]
     assert "oracle" not in task_configurations("sap/TorcsDriving-v0")  # the environment itself labels
+    racing = ["sac_ap:task", "sac:task", "tqc_ap:task", "tqc:task"]
+    assert task_configurations("sap/TorcsRacing-v0") == racing  # it cannot be copied
     guided, base, tuned, default = (
         run(text) for text in ("ddpg_ap:task", "ddpg:task", "ddpg:tuned[steps=300]", "ddpg")
     )
@@ -91,12 +93,9 @@ def test_a_configuration_may_have_fewer_seeds():
         ("ddpg:task[steps=0]", CAR, "steps must be 1 or more, but is 0"),
         ("ddpg:task[alpha=1]", CAR, "ddpg has no setting 'alpha'"),
         ("linear", CAR, f"The configuration linear is for lane keeping, but {CAR} is not"),
-        (
-            "oracle",
-            "sap/TorcsDriving-v0",
-            "a task whose entry in zoo_configs names an AP function, but sap/TorcsDriving",
-        ),
-        ("oracle", "highway", "names an AP function, but highway is not"),
+        ("oracle", "sap/TorcsDriving-v0", "that can be copied, but sap/TorcsDriving-v0 is not"),
+        ("oracle", "sap/TorcsRacing-v0", "that can be copied, but sap/TorcsRacing-v0 is not"),
+        ("oracle", "highway", "that can be copied, but highway is not"),
         ("oracle[alpha=1]", CAR, "oracle has no setting 'alpha'"),
     ],
 )

@@ -15,7 +15,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_sap.algorithms import ALGORITHMS, base_of
 from sb3_sap.benchmark.configurations import CONTROLLERS, Configuration, unknown_algorithm
 from sb3_sap.benchmark.linear import GAINS
-from sb3_sap.benchmark.task_settings import entry, task_settings
+from sb3_sap.benchmark.task_settings import entry, has_oracle, task_settings
 from sb3_sap.common.action_noise import make_action_noise
 from sb3_sap.common.extractors import with_extractor
 from sb3_sap.common.functions import resolve
@@ -122,9 +122,10 @@ def _of_controller(algo: str, simulator: str) -> dict[str, Any]:
     """Parameters of a controller: gains of the linear one, the AP function of the look-ahead oracle."""
     if algo == "linear" and simulator in GAINS:
         return dict(GAINS[simulator])
-    if algo == "oracle" and simulator not in ENVIRONMENTS and "ap_function" in (own := entry(algo, simulator)):
-        return {"ap_function": own["ap_function"]}
-    needed = "lane keeping" if algo == "linear" else "a task whose entry in zoo_configs names an AP function"
+    if algo == "oracle" and simulator not in ENVIRONMENTS and has_oracle(simulator):
+        return {"ap_function": entry(algo, simulator)["ap_function"]}
+    needed = "a task whose entry in zoo_configs names an AP function, and that can be copied"
+    needed = "lane keeping" if algo == "linear" else needed
     raise ValueError(f"The configuration {algo} is for {needed}, but {simulator} is not.")
 
 

@@ -83,7 +83,7 @@ def task_configurations(env_id: str) -> list[str]:
     """The configurations that are compared on a task.
 
     They are each guided algorithm with an entry, its base with the same settings, its base with RL Zoo's tuned settings
-    if there are any, and the look-ahead oracle unless the environment itself labels the actions.
+    if there are any, and the look-ahead oracle where it can act.
     """
     configurations = []
     for algo in guided_algorithms(env_id):
@@ -93,7 +93,14 @@ def task_configurations(env_id: str) -> list[str]:
         if tuned:
             steps = min(int(tuned["n_timesteps"]), LONGER * planned_steps(env_id))
             configurations.append(f"{base}:tuned[steps={steps},seeds={FEWER}]")
-    return configurations + (["oracle"] if "ap_function" in entry("oracle", env_id) else [])
+    return configurations + (["oracle"] if has_oracle(env_id) else [])
+
+
+def has_oracle(env_id: str) -> bool:
+    """Whether the look-ahead oracle can act: there is an AP function, and the environment can be copied, which TORCS
+    cannot.
+    """
+    return "ap_function" in entry("oracle", env_id) and "Torcs" not in env_id
 
 
 def ways_of(env_id: str) -> list[str]:

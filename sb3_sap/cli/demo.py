@@ -18,7 +18,7 @@ from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.cli.animation import animate
 from sb3_sap.cli.hub import EXTRAS
 from sb3_sap.cli.laps import drive_tracks, results_table
-from sb3_sap.cli.options import add_path, add_simulator
+from sb3_sap.cli.racing_demo import RacingRun, racing_demo
 from sb3_sap.cli.training_log import TrainingLog, ctrl_c_stops
 from sb3_sap.common.command_line import not_negative, positive
 from sb3_sap.common.files import atomic_path
@@ -111,33 +111,51 @@ def draw(run: Run, model: Any, training: pd.DataFrame) -> None:
         save(predictor_probabilities(model, SPEED), run.out / "predictor.png")
 
 
+#: Options that only lane keeping has.
+LANE_KEEPING_ONLY = ("preset", "simulator", "predictor", "animation")
+
+
 def add_demo(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Adds ``sb3-sap demo``."""
-    default = Run()
+    default, racing = Run(), RacingRun()
     steering = [name for name, algorithm in ALGORITHMS.items() if not cast(Any, algorithm).discrete]
     command = commands.add_parser(
         "demo",
-        help="train a car to keep its lane, then drive the unseen tracks",
+        help="train a car to keep its lane, then drive the unseen tracks; or to race",
         description="Trains on one track, drives one lap of each of the paper's four test tracks with the actor alone, "
         "prints a table, and leaves model.zip, predictor.pt, run.json, training.csv, evaluation.json, "
-        "learning_curve.png, predictor.png and lap.gif in the output folder.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        "learning_curve.png, predictor.png and lap.gif in the output folder. With --task racing, on TORCS, the policy "
+        "imitates what was permissible in a scripted driver's log; its lap and the driver's are left as lap.png "
+        "and laps.csv.",
+        argument_default=argparse.SUPPRESS,  # the tasks have different defaults
     )
-    command.add_argument("--algo", choices=steering, default=default.algo, help="the algorithm")
-    command.add_argument(
-        "--preset", default=argparse.SUPPRESS, help="named settings of zoo_configs (default: fast, where there is one)"
-    )
-    command.add_argument("--steps", type=positive, default=default.steps, help="training steps")
-    command.add_argument("--seed", type=not_negative, default=default.seed, help="seed of everything random")
-    command.add_argument("--track", default=default.track, help="track to train on: a name, a file or random:SEED")
-    add_simulator(command)
-    command.add_argument("--out", type=Path, default=default.out, help="output folder")
+    command.add_argument("--task", choices=("lane-keeping", "racing"), help="what to learn (default: lane-keeping)")
+
+    def add(name: str, text: str, **settings: Any) -> None:
+        own, raced = getattr(default, name), getattr(racing, name, None)
+        shown = f"{own}; racing: {raced}" if raced not in (None, own) else f"{own}"
+        command.add_argument(f"--{name}", help=f"{text} (default: {shown})", **settings)
+
+    add("algo", "the algorithm", choices=steering)
+    command.add_argument("--preset", help="named settings of zoo_configs (default: fast, where there is one)")
+    add("steps", "training steps, for racing after the imitation", type=positive)
+    add("seed", "seed of everything random", type=not_negative)
+    add("track", "track to train on: a name, a file or, on the embedded simulator, random:SEED")
+    add("simulator", "what the car drives on", choices=list(ENVIRONMENTS))
+    add("out", "output folder", type=Path)
     text = "an AP predictor to begin with, such as predictor.pt of an earlier run"
-    add_path(command, "--predictor", metavar="FILE", help=text)
-    command.add_argument("--animation", action=argparse.BooleanOptionalAction, default=True, help="draw lap.gif")
+    command.add_argument("--predictor", type=Path, metavar="FILE", help=text)
+    command.add_argument("--animation", action=argparse.BooleanOptionalAction, help="draw lap.gif (default: yes)")
     command.set_defaults(run=_demo)
 
 
 def _demo(options: argparse.Namespace, console: Console) -> int:
-    demo(Run(**{name: value for name, value in vars(options).items() if name != "run"}), console)
+    given = {name: value for name, value in vars(options).items() if name != "run"}
+    if given.pop("task", None) != "racing":
+        demo(Run(**given), console)
+        return 0
+    for name in given:
+        if name in LANE_KEEPING_ONLY:
+            raise ValueError(f"`--task racing` has no --{name}: leave it out.")
+    racing_demo(RacingRun(**given), console)
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import register
@@ -12,6 +12,9 @@ from sb3_sap.envs.car import CarState, Simulator
 from sb3_sap.envs.constraints import constraint_ce1, constraint_ce2
 from sb3_sap.envs.lane_keeping import OFF_TRACK_REWARD, LaneKeepingEnv, ap_function, score
 from sb3_sap.envs.tracks import TRACKS, Track, get_track
+
+if TYPE_CHECKING:
+    from sb3_sap.envs.torcs.racing import RacingEnv
 
 #: Control steps after which an episode is truncated: enough for a lap of the longest track (Spring, 8,000 steps at
 #: 50 km/h and 0.2 s).
@@ -110,10 +113,31 @@ def make_grid(task: str = "DoorKey-5x5", render_mode: str | None = None) -> gym.
     return LabelledGrid(gym.make(f"MiniGrid-{task}-v0", render_mode=render_mode))
 
 
+def make_torcs_racing(
+    track: str | os.PathLike[str] = "wheel-2",
+    control_step: float = 0.1,
+    car: str = "car1-trb1",
+    start: str = "race",
+    laps: int | None = 1,
+    random_start: bool = False,
+    skill_level: int = 0,
+    render_mode: str | None = None,
+) -> RacingEnv:
+    """Make `RacingEnv`: what ``gym.make("sap/TorcsRacing-v0", …)`` calls.
+
+    The parameters are those of `make_torcs_lane_keeping`, and ``skill_level``, 0 (rookie) to 3 (pro): a rookie's tyres
+    hold best, and only a rookie's car takes no damage.
+    """
+    from sb3_sap.envs.torcs.racing import RacingEnv
+
+    return RacingEnv(track, control_step, car, start, laps, random_start, skill_level, render_mode)
+
+
 for _name, _maker in {
     "sap/LaneKeeping-v0": make_lane_keeping,
     "sap/TorcsLaneKeeping-v0": make_torcs_lane_keeping,
     "sap/TorcsDriving-v0": make_torcs_driving,
+    "sap/TorcsRacing-v0": make_torcs_racing,
 }.items():
     _maker.metadata = LaneKeepingEnv.metadata  # type: ignore[attr-defined]  # gym.make reads the render modes from it
     register(_name, f"{__name__}:{_maker.__name__}", max_episode_steps=MAX_EPISODE_STEPS)
@@ -137,5 +161,6 @@ __all__ = [
     "make_lane_keeping",
     "make_torcs_driving",
     "make_torcs_lane_keeping",
+    "make_torcs_racing",
     "score",
 ]

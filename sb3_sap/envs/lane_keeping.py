@@ -109,12 +109,10 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         off_track_reward: float = OFF_TRACK_REWARD,
         render_mode: str | None = None,
     ) -> None:
-        if laps is not None and (isinstance(laps, bool) or not isinstance(laps, (int, np.integer)) or laps < 1):
-            raise ValueError(f"laps must be a positive whole number, or None to drive on, got {laps!r}.")
+        check_laps(laps)
         if not (isinstance(off_track_reward, (int, float, np.number)) and math.isfinite(off_track_reward)):
             raise ValueError(f"off_track_reward must be a number, got {off_track_reward!r}.")
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode!r}.")
+        check_render_mode(render_mode)
         self.simulator = simulator
         self.laps = laps
         self.random_start = random_start
@@ -138,7 +136,7 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
             start["distance"] = self.np_random.uniform(0.0, self.simulator.length)
             start["track_pos"] = self.np_random.uniform(-RANDOM_TRACK_POS, RANDOM_TRACK_POS)
             start["angle"] = self.np_random.uniform(-RANDOM_ANGLE, RANDOM_ANGLE)
-        start.update(_checked_start(options or {}, self.simulator.length))
+        start.update(checked_start(options or {}, self.simulator.length))
         self._state = self.simulator.reset(**start)
         self._on_road = True
         self._steering = 0.0
@@ -220,7 +218,23 @@ class LaneKeepingEnv(gym.Env[Observation, Action]):
         return {**self._state._asdict(), "covered": covered, "off_track": off_track, "lap_done": lap_done}
 
 
-def _checked_start(options: Mapping[str, Any], length: float) -> dict[str, float]:
+def check_laps(laps: Any) -> None:
+    """Refuses a number of laps that cannot be driven."""
+    if laps is not None and (isinstance(laps, bool) or not isinstance(laps, (int, np.integer)) or laps < 1):
+        raise ValueError(f"laps must be a positive whole number, or None to drive on, got {laps!r}.")
+
+
+def check_render_mode(render_mode: Any) -> None:
+    """Refuses a render mode that does not exist."""
+    if render_mode not in (None, "human", "rgb_array"):
+        raise ValueError(f"render_mode must be None, 'human' or 'rgb_array', got {render_mode!r}.")
+
+
+def checked_start(options: Mapping[str, Any], length: float) -> dict[str, float]:
+    """The start that ``options`` of `reset` choose on a road of ``length`` m.
+
+    :raise ValueError: for a name or a place that does not exist
+    """
     bounds = {"distance": (0.0, length, "m"), "track_pos": (-1.0, 1.0, ""), "angle": (-math.pi / 2, math.pi / 2, "rad")}
     start = {}
     for name, value in options.items():

@@ -16,6 +16,7 @@ from sb3_sap.envs.torcs.probe import survives
 from sb3_sap.envs.torcs.readings import CarReadings
 from sb3_sap.envs.torcs.road import Road
 from sb3_sap.envs.torcs.structures import PLACED, RUNNING, RaceStructure, SituationStructure
+from sb3_sap.envs.torcs.tick_loop import tick_loop
 from sb3_sap.envs.torcs.track_files import flatten
 
 #: One step of the physics, s.
@@ -88,6 +89,8 @@ class Physics(CarReadings):
 
     def _make_structures(self) -> None:
         self._situation: Any = SituationStructure()
+        situation = ctypes.addressof(self._situation)
+        self._run = tick_loop(self._library.update, situation, TICK)
         self._race: Any = RaceStructure()
         self._cars = (ctypes.c_void_p * 1)(ctypes.addressof(self.car))
         self._situation.n_cars = 1
@@ -95,7 +98,7 @@ class Physics(CarReadings):
         self._situation.max_damage = MAX_DAMAGE
         self._situation.cars = ctypes.addressof(self._cars)
         self._race.car_list = ctypes.addressof(self.car)
-        self._race.situation = ctypes.addressof(self._situation)
+        self._race.situation = situation
         self._race.track = ctypes.addressof(self.road.structure)
 
     def place(self, distance: float, track_pos: float = 0.0, angle: float = 0.0, height: float = DROP_HEIGHT) -> None:
@@ -112,7 +115,7 @@ class Physics(CarReadings):
             self._library.shutdown()
         ctypes.memset(ctypes.addressof(self.car), 0, ctypes.sizeof(self.car))
         self.car.skill_level, self.car.car_handle = self._skill_level, self._car_handle
-        write_place(self.car, self.road, self._shared, distance, track_pos, angle, height)
+        write_place(self.car, self.road, self.shared, distance, track_pos, angle, height)
         self._situation.race_state, self._situation.current_time = PLACED, 0.0
         self._library.init(1, ctypes.addressof(self.road.structure), *self._factors)
         self._running = True
@@ -146,11 +149,11 @@ class Physics(CarReadings):
 
     def advance(self, ticks: int, race_state: int = RUNNING) -> None:
         """Advances the physics by a number of ticks of 2 ms."""
-        self._check_running()
+        if not self._running:
+            self._check_running()
         self._situation.race_state = race_state
-        update, situation = self._library.update, ctypes.addressof(self._situation)
-        for _ in range(ticks):
-            update(situation, TICK, -1)
+        if ticks > 0:
+            self._run(ticks)
 
     def drive_everywhere(self) -> None:
         """Places the car at many places and drives a little, to see whether TORCS survives it."""

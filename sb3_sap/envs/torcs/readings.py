@@ -22,7 +22,7 @@ class CarReadings:
         self.road = road
         self.length = road.length
         self.car: Any = CarStructure()
-        self._shared = shared
+        self.shared = shared
         self._running = False  # whether the car is on the road
         self._position: Any = self.car.position
         # Looked up once, because ctypes makes a new object for each access.
@@ -45,7 +45,7 @@ class CarReadings:
     def heading(self) -> float:
         """Heading of the road where the car is, rad."""
         self._check_running()  # without a segment TORCS would read from address 0
-        return self._shared.heading(self._at)  # type: ignore[no-any-return]
+        return self.shared.heading(self._at)  # type: ignore[no-any-return]
 
     @property
     def angle(self) -> float:

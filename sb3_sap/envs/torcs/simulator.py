@@ -6,6 +6,7 @@ import math
 import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,24 +42,15 @@ class TorcsSimulator:
         car: str = "car1-trb1",
         start: str = "training",
     ):
-        if start not in STARTS:
-            raise ValueError(f"start must be one of {', '.join(map(repr, STARTS))}, got {start!r}.")
+        check_start(start)
         if not (isinstance(speed, (int, float, np.number)) and 0 < speed <= 300):
             raise ValueError(f"speed must lie above 0 and not above 300 km/h, got {speed!r}.")
-        ticks = (
-            round(control_step / TICK)
-            if isinstance(control_step, (int, float, np.number)) and 0 < control_step < math.inf
-            else 0
-        )
-        if ticks < 1 or abs(ticks * TICK - control_step) > 1e-9:
-            raise ValueError(f"control_step must be a positive multiple of {TICK} s, got {control_step!r}.")
+        ticks = step_ticks(control_step)
         self.simulation = Physics(track, car)
         self.control_step = control_step
         self.length = self.simulation.length
         self.track = read_track_xml(self.simulation.track_path)
-        self.start = {"distance": self.length - TRAINING_DISTANCE, "track_pos": 0.0, "angle": 0.0}
-        if start == "race":
-            self.start |= race_grid(self.simulation.track_path, self.length)
+        self.start = start_place(start, self.simulation.track_path, self.length)
         whole, rest = divmod(ticks, PERIOD_TICKS)
         self._periods = [PERIOD_TICKS] * whole + ([rest] if rest else [])
         self._throttle = SpeedHolder(speed)
@@ -94,6 +86,30 @@ class TorcsSimulator:
         simulation = self.simulation
         x, y, z = simulation.velocity
         return CarState(simulation.angle, simulation.track_pos, x * KMH, y * KMH, z * KMH, simulation.distance)
+
+
+def check_start(start: Any) -> None:
+    """Refuses a start that is not one of `STARTS`."""
+    if start not in STARTS:
+        raise ValueError(f"start must be one of {', '.join(map(repr, STARTS))}, got {start!r}.")
+
+
+def step_ticks(control_step: Any) -> int:
+    """The number of the physics' ticks in a control step.
+
+    :raise ValueError: unless it is a positive multiple of `TICK`
+    """
+    known = isinstance(control_step, (int, float, np.number)) and 0 < control_step < math.inf
+    ticks = round(control_step / TICK) if known else 0
+    if ticks < 1 or abs(ticks * TICK - control_step) > 1e-9:
+        raise ValueError(f"control_step must be a positive multiple of {TICK} s, got {control_step!r}.")
+    return ticks
+
+
+def start_place(start: str, path: Path, length: float) -> dict[str, float]:
+    """Distance (m), track_pos and angle (rad) of one of `STARTS`."""
+    place = {"distance": length - TRAINING_DISTANCE, "track_pos": 0.0, "angle": 0.0}
+    return place | race_grid(path, length) if start == "race" else place
 
 
 def race_grid(path: Path, length: float) -> dict[str, float]:

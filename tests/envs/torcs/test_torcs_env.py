@@ -18,7 +18,7 @@ from sb3_sap.envs.car import STEERING_LOCK
 from sb3_sap.envs.torcs.probe import survives
 from sb3_sap.envs.torcs.track_files import flatten
 
-ENVIRONMENTS = ["sap/TorcsLaneKeeping-v0", "sap/TorcsDriving-v0"]
+ENVIRONMENTS = ["sap/TorcsLaneKeeping-v0", "sap/TorcsDriving-v0", "sap/TorcsRacing-v0"]
 
 
 def feedback(env):

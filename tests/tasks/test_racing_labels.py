@@ -1,0 +1,125 @@
+"""The AP functions of racing, on transitions computed by hand; TORCS is not needed."""
+
+import numpy as np
+import pytest
+
+from sb3_sap.envs.torcs.range_finders import DIRECTIONS
+from sb3_sap.envs.torcs.sensors import INDEX, TRACK, UNITS
+from sb3_sap.tasks.racing import (
+    ANGLE,
+    RACING_PARTS,
+    RANGE,
+    SPEED,
+    SPEED_X,
+    SPEED_Y,
+    TRACK_POS,
+    free_view,
+    lateral_speed,
+    racing,
+)
+from sb3_sap.tasks.racing import DIRECTIONS as OWN_DIRECTIONS
+from sb3_sap.tasks.racing import TRACK as OWN_TRACK
+
+
+def observe(speed=20.0, sideways=0.0, angle=0.0, track_pos=0.0, view=100.0, direction=0.0, left=6.0, right=6.0):
+    """An observation from raw values: m/s, rad, m; the longest range finder points to ``direction`` degrees."""
+    obs = np.zeros((1, 30))
+    obs[0, TRACK] = 5.0
+    obs[0, INDEX["track[0]"]], obs[0, INDEX["track[18]"]] = left, right
+    obs[0, INDEX[f"track[{9 - round(direction / 10)}]"]] = view
+    obs[0, INDEX["angle"]], obs[0, INDEX["trackPos"]] = angle, track_pos
+    obs[0, INDEX["speedX"]], obs[0, INDEX["speedY"]] = speed * 3.6, sideways * 3.6
+    return obs / UNITS
+
+
+def steering(before, action, after):
+    return bool(racing(before, np.array([[action, 0.5]]), after)[0, 0])
+
+
+def pedal(before, action, after):
+    return bool(racing(before, np.array([[0.0, action]]), after)[0, 1])
+
+
+def test_parts_are_the_columns():
+    assert RACING_PARTS == {"steering": [0], "pedal": [1]}
+    labels = racing(observe(), np.zeros((1, 2)), observe())
+    assert labels.shape == (1, 2)
+    assert labels.dtype == bool
+
+
+def test_entries_are_those_of_the_environment():
+    names = "angle", "trackPos", "speedX", "speedY"
+    assert [INDEX[name] for name in names] == [ANGLE, TRACK_POS, SPEED_X, SPEED_Y]
+    assert TRACK == OWN_TRACK
+    assert UNITS[TRACK].tolist() == [RANGE] * 19
+    assert UNITS[[SPEED_X, SPEED_Y]] / 3.6 == pytest.approx([SPEED] * 2)
+    assert pytest.approx(DIRECTIONS) == OWN_DIRECTIONS
+
+
+def test_lateral_speed_and_view():
+    # 10 m/s; a negative angle is a car that points to the left of the road
+    assert lateral_speed(observe(speed=10, angle=-np.pi / 6)) == pytest.approx([5.0])
+    assert lateral_speed(observe(speed=0, sideways=2)) == pytest.approx([2.0])
+    metres, direction = free_view(observe(view=50, direction=-30))
+    assert (metres[0], direction[0]) == pytest.approx((50.0, -np.pi / 6))
+
+
+def test_running_wide_is_a_mistake_of_the_steering():
+    # 1 m from the left edge at 20·sin 0.1 = 2 m/s: it is there in half a second
+    before, after = observe(angle=-0.08, track_pos=0.8, left=1.2), observe(angle=-0.1, track_pos=0.83, left=1.0)
+    assert not steering(before, 0.0, after)
+    assert not steering(before, -0.4, after)  # to the right, but not half way
+    assert steering(before, -0.6, after)
+    assert steering(observe(angle=-0.12, track_pos=0.8), 0.0, after)  # lateral speed was taken away
+    far = observe(angle=-0.1, track_pos=0.5, left=3.0)
+    assert steering(before, 0.0, far)  # one and a half seconds left
+    # the same to the right
+    assert not steering(observe(angle=0.08, track_pos=-0.8), 0.0, observe(angle=0.1, track_pos=-0.83, right=1.0))
+
+
+def test_turning_in_against_the_bend_is_a_mistake_of_the_steering():
+    before = observe(direction=30, view=40)
+    assert not steering(before, -0.2, observe(direction=40, view=40))
+    assert steering(before, 0.2, observe(direction=40, view=40))  # towards it
+    assert steering(before, -0.05, observe(direction=40, view=40))  # hardly turned
+    assert steering(before, -0.2, observe(direction=30, view=40))  # it did not lie further aside
+    assert steering(observe(direction=20, view=40), -0.2, observe(direction=30, view=40))  # not much of a bend
+    assert steering(observe(direction=30, view=40, sideways=2), -0.2, observe(direction=40, view=40))  # catches a slide
+    assert not steering(observe(direction=-30), 0.2, observe(direction=-40))
+
+
+def test_throttle_too_fast_for_what_is_in_sight_is_a_mistake_of_the_pedal():
+    # 25 m/s² stop a car of 50 m/s within 50 m
+    assert not pedal(observe(speed=51, view=50), 0.5, observe(speed=51.5, view=45))
+    assert pedal(observe(speed=49, view=50), 0.5, observe(speed=49.5, view=45))
+    assert pedal(observe(speed=51, view=50), -0.5, observe(speed=50, view=45))
+    assert pedal(observe(speed=51, view=50), 0.5, observe(speed=50.9, view=45))  # it did not get faster
+
+
+def test_dawdling_is_a_mistake_of_the_pedal():
+    # 4 m/s² stop a car of 20 m/s within 50 m
+    slow, as_slow = observe(speed=19, view=50), observe(speed=19, view=48)
+    assert not pedal(slow, 0.0, as_slow)
+    assert pedal(slow, 0.1, as_slow)
+    assert pedal(slow, 0.0, observe(speed=19.5, view=48))  # downhill
+    assert pedal(observe(speed=21, view=50), 0.0, observe(speed=21, view=48))
+    standing = observe(speed=0, view=50)
+    assert not pedal(standing, 0.0, standing)
+    assert pedal(standing, 0.5, standing)
+    # badly placed it may be right
+    assert pedal(observe(speed=19, view=50, angle=0.5), 0.0, as_slow)
+    assert pedal(observe(speed=19, view=50, track_pos=0.9), 0.0, as_slow)
+
+
+def test_braking_on_an_open_road_is_a_mistake_of_the_pedal():
+    # 6 m/s² stop a car of 30 m/s within 75 m
+    assert not pedal(observe(speed=29, view=75), -0.1, observe(speed=28, view=72))
+    assert pedal(observe(speed=31, view=75), -0.1, observe(speed=30, view=72))
+    assert pedal(observe(speed=29, view=75), 0.0, observe(speed=28.9, view=72))
+    assert pedal(observe(speed=29, view=75, angle=-0.5), -0.1, observe(speed=28, view=72))
+
+
+def test_parts_are_blamed_apart():
+    before, after = observe(19, 0, -0.08, 0.7, 50, left=1.2), observe(18, 0, -0.12, 0.75, 50, left=1.0)
+    both = racing(np.repeat(before, 2, 0), np.array([[0.0, -1.0], [-1.0, 1.0]]), np.repeat(after, 2, 0))
+    assert both.tolist() == [[False, False], [True, True]]

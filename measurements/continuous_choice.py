@@ -54,7 +54,11 @@ def estimates(mean: float, n: int, error: float, rng: np.random.Generator) -> di
     """Mean and standard deviation of each estimate of the gradient, from one action."""
     space = spaces.Box(-1, 1, (1,))
     judge: Any = Above()
-    settings = {"n_candidates": n, "squashed": False, "predicts": True}  # which keeps no draws for an update
+    settings: dict[str, Any] = {
+        "n_candidates": n,
+        "squashed": False,
+        "predicts": True,
+    }  # which keeps no draws for an update
     guide = DrawingGuide(judge, space, KnownMasks([]), th.device("cpu"), **settings)
     distribution = DiagGaussianDistribution(1).proba_distribution(
         th.full((SAMPLES, 1), mean), th.full((SAMPLES, 1), float(np.log(SIGMA)))

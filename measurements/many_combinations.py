@@ -98,7 +98,7 @@ def measure(name: str, seed: int) -> dict[str, Any]:
     def score(agent: Any) -> float:
         test = env()
         test.reset(seed=10_000 + seed)
-        return float(evaluate_policy(agent, test, EPISODES, deterministic=False)[0])
+        return float(np.mean(evaluate_policy(agent, test, EPISODES, deterministic=False)[0]))
 
     guided = CASES[name].get("alpha", 1)
     bad, good = model.knowledge.seen

@@ -76,7 +76,8 @@ def race(root: Path, robot: str, driver: int, track: str) -> list[dict[str, floa
         own.parent.mkdir(parents=True)
         shutil.copy(own_driver(data / "drivers" / robot / f"{robot}.xml", driver, local), own)
         (local / "race.xml").write_text(RACE.format(track=track, laps=LAPS, robot=robot, driver=driver))
-        command = [libraries / "torcs-bin", "-l", local, "-L", libraries, "-D", data, "-r", local / "race.xml"]
+        command = [str(libraries / "torcs-bin"), *map(str, ("-l", local, "-L", libraries, "-D", data))]
+        command += ["-r", str(local / "race.xml")]
         found = [str(libraries / "lib"), str(root / LIBRARIES), os.environ.get("LD_LIBRARY_PATH", "")]
         environment = {**os.environ, "LD_LIBRARY_PATH": ":".join(found)}
         try:

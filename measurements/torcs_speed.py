@@ -6,6 +6,7 @@ machine slow down the others. The cars drive at 50 km/h. The physics alone is an
 python measurements/torcs_speed.py [TRACK]
 """
 
+import functools
 import sys
 import time
 from collections.abc import Callable
@@ -78,7 +79,7 @@ def main(track: str = "wheel-2") -> None:
             inner: Any = env.unwrapped
             simulation = inner.simulation if env_id == RACING else inner.simulator.simulation
             # From the state of the drive, with the controls held: on wheel-2 this is still on the road.
-            alone = TICKS / fastest(lambda simulation=simulation: simulation.advance(TICKS))
+            alone = TICKS / fastest(functools.partial(simulation.advance, TICKS))
             share = rate * control_step / (alone * TICK)
             print(
                 f"{env_id}, control step {control_step} s: {rate:,.0f} steps/s, {rate * control_step:,.0f}× real time; "

@@ -58,14 +58,16 @@ def started_labels(buffer):
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["log", "random"])
 def test_starts_from_a_log(source):
-    cloned, taught = model("cloned", source), model("taught", source)
-    for one in (cloned, taught):
+    cloned, imitated, taught = (model(start, source) for start in ("cloned", "imitated", "taught"))
+    for one in (cloned, imitated, taught):
         one._prepare()
         assert one.held_until == started.HOLD
         assert len(one.replay_buffer.prior) == 1
     assert not cloned.predictor.fitted
     assert cloned.knowledge.prior is None
+    assert imitated.predictor.fitted
     assert taught.predictor.fitted
+    assert not same(imitated.actor, taught.actor)
     taught.learn(20)
     assert taught.num_timesteps == 20
 

@@ -116,6 +116,7 @@ GROUPS: dict[str, list[str]] = {
             ("loss", "policy_predictor"),
             ("penalty", "replay"),
             ("penalty", "cloned"),
+            ("loss", "imitated"),
             ("loss", "taught"),
             ("penalty", "cloned,source=log"),
             ("loss", "taught,source=log"),

@@ -18,8 +18,9 @@ from sb3_sap.transitions.batch import Transitions
 from sb3_sap.transitions.sources import batches_of, joined
 
 #: What a run begins with: nothing; the predictor of the source, which teaches the policy; its policy, or both; its
-#: transitions with their rewards; beside those a policy that imitates all of its actions, or that E has taught.
-STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "taught")
+#: transitions with their rewards; beside those a policy that imitates all of its actions, or the permissible ones, or
+#: that E has taught.
+STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "imitated", "taught")
 #: Those that teach the policy what E permits.
 TAUGHT = ("predictor", "taught")
 #: Where it comes from: an agent on the embedded simulator; on the simulator of the run itself a linear controller with
@@ -79,18 +80,18 @@ class StartedMixin:
             clone(self, joined(list(batches_of(transitions))))
             self.held_until = HOLD
             return
-        if self.start in ("replay", "taught"):
+        if self.start in ("replay", "imitated", "taught"):
             self.add_knowledge(transitions, into="replay" if self.start == "replay" else "both")
         elif donor is None:
             self.add_knowledge(transitions, into="knowledge")
-        if self.start == "taught" or (donor is None and self.start == "predictor"):
+        if self.start in ("imitated", "taught") or (donor is None and self.start == "predictor"):
             self.fit_predictor()
         elif "predictor" in self.start:
             donor.fit_predictor()
             self.predictor_kwargs: Any = {}
             self.set_predictor(donor.predictor)
-        if self.start in TAUGHT:
-            self.teach_policy(hold=HOLD)
+        if self.start in (*TAUGHT, "imitated"):
+            self.teach_policy(hold=HOLD, imitate=self.start == "imitated")
 
 
 def agent(cls: Any, seed: int) -> Any:

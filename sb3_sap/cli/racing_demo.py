@@ -68,7 +68,7 @@ def racing_demo(run: RacingRun, console: Console) -> dict[str, RaceLap]:
     console.print(str(model.add_knowledge(log(driver, run.track, run.seed))))
     console.print(str(model.fit_predictor()))
     console.print(f"[bold]{algorithm.__name__}[/] imitates what was permissible")
-    model.teach_policy(TAUGHT, hold=run.steps // 2, imitate=True)
+    model.teach_policy(TAUGHT, hold=run.steps // 2)
     laps = {algorithm.__name__: race(model, run.track), "scripted": race(driver, run.track)}
     if run.steps:
         console.print(f"It learns for {run.steps:,} steps, the first half of them with the policy as it is")

@@ -114,19 +114,19 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
         step = permissible_value_step if self.discrete else permissible_actor_step
         return step(self if self.discrete else self.actor, self.predictor, observations, coef)
 
-    def teach_policy(self, steps: int = 1_000, hold: int = 0, imitate: bool = False) -> float:
+    def teach_policy(self, steps: int = 1_000, hold: int = 0, imitate: bool | None = None) -> float:
         """Teaches the policy what is permissible, before the first step.
 
-        A continuous actor moves to what E permits, no further than it demands
-        (:func:`~sb3_sap.guidance.teaching.taught_step`), and the values of discrete actions learn to prefer what E
-        permits (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`), in the states of :meth:`add_knowledge`, or
-        else of K, or else in those that came with the predictor. Target networks follow.
+        A continuous actor imitates the permissible actions of :meth:`add_knowledge`, or else of K. If there are none,
+        it moves to what E permits, no further than it demands (:func:`~sb3_sap.guidance.teaching.taught_step`), in the
+        states that came with the predictor. The values of discrete actions learn to prefer what E permits
+        (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`). Target networks follow.
 
         :param steps: gradient steps
         :param hold: timesteps from now on for which a continuous actor stays as it was taught, while the critics learn
             what its actions are worth: at first they would lead it astray
-        :param imitate: whether a continuous actor imitates the permissible actions of the log instead. That is better
-            where somebody drove well and the label permits much else
+        :param imitate: whether a continuous actor imitates, or is taught by E whatever is known. ``None``: it imitates
+            if permissible actions are known
         :return: the mean loss of the last tenth of them
         :raise ValueError: if no state is known, or E was not fitted; to imitate, if no permissible action is known
         """
@@ -134,6 +134,8 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
             raise ValueError(f"`steps` must be at least 1, but is {steps!r}.")
         if imitate and self.discrete:
             raise ValueError("`imitate` needs continuous actions: leave it out.")
+        if imitate is None:
+            imitate = not self.discrete and self.knows_permissible
         losses, n = [], self.predictor.batch_size
         lessons: Any = self.known_actions(n) if imitate else self.known_states(n)
         for lesson in itertools.islice(lessons, steps):

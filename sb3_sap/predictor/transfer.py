@@ -221,13 +221,18 @@ class PriorKnowledgeMixin(LearnedPredictorMixin):
                 obs = obs if normalize is None else normalize.normalize_obs(obs)
             yield obs_as_tensor(cast(Any, obs), self.device)
 
+    @property
+    def knows_permissible(self) -> bool:
+        """Whether the log, or else K, has permissible actions."""
+        return (self.knowledge.prior or self.knowledge).counts("train")[PERMISSIBLE] > 0
+
     def known_actions(self, n: int) -> Iterator[tuple[Any, th.Tensor]]:
         """Batches of n observation tensors and (n, action_dim) scaled permissible actions of the log or K.
 
         :raise ValueError: if there are none
         """
         source = self.knowledge.prior or self.knowledge
-        if source.counts("train")[PERMISSIBLE] == 0:
+        if not self.knows_permissible:
             raise ValueError("The policy cannot imitate, because no permissible action is known: use `add_knowledge`.")
         self._begin_statistics(source)
         while True:

@@ -14,6 +14,7 @@ from states import assert_same_state
 from toy import Line, build, towards_centre
 
 from sb3_sap import DDPGAP, DQNAP, PPOAP, SACAP, CrossQAP, PermissibilityPredictor
+from sb3_sap.predictor.pairs import ManyActions
 from sb3_sap.predictor.risk import RiskTarget, Steps, steps_at_risk
 
 LENGTH = 6
@@ -127,7 +128,7 @@ def test_permissible_is_what_is_below_the_threshold():
     tensors = th.as_tensor(obs), th.as_tensor(actions)
     with th.no_grad():
         verdicts = strict(*tensors).numpy() > 0
-        [each] = strict.logits_of_each([strict.features(tensors[0])], tensors[1])
+        [each] = ManyActions(strict, tensors[1]).logits([strict.features(tensors[0])])
     np.testing.assert_array_equal(verdicts, probabilities > 0.7)
     np.testing.assert_allclose(each.diagonal(), strict(*tensors).detach(), atol=1e-5)
 

@@ -352,7 +352,7 @@ def test_taught_policy_is_held_while_the_critics_learn(algorithm):
 def test_taught_stochastic_policy_explores_around_what_is_permitted():
     model, _ = known(SACAP, policy_kwargs={"net_arch": [32]}, learning_rate=0.01)
     model.fit_predictor(epochs=6)
-    model.teach_policy(300)
+    model.teach_policy(300, imitate=False)
     drawn = model.predict(np.tile(np.array([[0.5, 0.5]], np.float32), (500, 1)))[0]
     assert drawn.mean() < -0.05
     assert drawn.std() == pytest.approx(SPREAD, rel=0.3)
@@ -361,7 +361,7 @@ def test_taught_stochastic_policy_explores_around_what_is_permitted():
 def test_taught_policy_moves_no_further_than_e_demands():
     model, _ = known(policy_kwargs={"net_arch": [32]}, learning_rate=0.01)
     model.fit_predictor()
-    model.teach_policy(1_000)
+    model.teach_policy(1_000, imitate=False)
     obs = np.array([[-0.8, 0.5], [0.8, 0.5]], np.float32)
     assert (np.abs(model.predict(obs)[0]) < 0.6).all()  # any push in the right direction is permissible
 
@@ -400,7 +400,7 @@ def test_policy_imitates_the_permissible_actions_of_a_log(algorithm):
     log["labels"] = rng.random(2_000) < 0.5
     log["actions"] = np.where(log["labels"][:, None], rng.normal(-0.6, 0.05, (2_000, 1)), 0.6).astype(np.float32)
     model, _ = known(algorithm, log=log, policy_kwargs={"net_arch": [32]}, learning_rate=0.01)
-    model.teach_policy(600, imitate=True)
+    model.teach_policy(600)
     drawn = model.predict(np.tile(np.array([[0.5, 0.5]], np.float32), (500, 1)))[0]
     assert drawn.mean() == pytest.approx(-0.6, abs=0.1)
     assert drawn.std() == pytest.approx(0.05 if algorithm is SACAP else 0, abs=0.06)
@@ -435,7 +435,7 @@ def test_policy_cannot_be_taught_by_nothing():
     with pytest.raises(ValueError, match="nothing is known"):
         build(DDPGAP).teach_policy()
     with pytest.raises(ValueError, match="call `fit_predictor` first"):
-        known()[0].teach_policy()
+        known()[0].teach_policy(imitate=False)
     with pytest.raises(ValueError, match="no permissible action is known"):
         build(DDPGAP).teach_policy(imitate=True)
     with pytest.raises(ValueError, match="needs continuous actions"):

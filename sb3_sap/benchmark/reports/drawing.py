@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from typing import Any
 
@@ -18,25 +19,38 @@ from sb3_sap.evaluation.statistics import bootstrap_interval
 WIDTH = 9
 #: Letters of a legend that fit side by side below a figure.
 LEGEND_WIDTH = 110
+#: Maximum number of lines in one panel where configurations are of several algorithms.
+TOGETHER = 8
 
 
 def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: str, y_label: str) -> Figure:
-    """A line for every configuration: the interquartile mean of ``y`` over its runs, and its bootstrap interval."""
-    figure = Figure(figsize=(WIDTH, 4.5), layout="constrained")
-    axes = figure.subplots()
-    axes.set(xlabel=x_label, ylabel=y_label)
-    axes.grid(alpha=0.3)
-    for number, name in enumerate(names):
-        wide = table[table["configuration"] == name].pivot(index=x, columns="seed", values=y).dropna(how="all")
-        means, bands = [], []
-        for values in wide.to_numpy():
-            known = values[~np.isnan(values)]
-            means.append(stats.trim_mean(known, 0.25))
-            bands.append(bootstrap_interval(known[:, None], resamples=500))
-        _line(axes, number, name, wide.index, means, *np.transpose(bands))
-    labels = axes.get_legend_handles_labels()[1]
-    beside = LEGEND_WIDTH // (6 + max(map(len, labels)))  # the line and the gap of an entry are as wide as six letters
-    figure.legend(loc="outside lower center", ncols=min(len(labels), max(1, beside)))
+    """A line for every configuration: the interquartile mean of ``y`` over its runs, and its bootstrap interval.
+
+    More than `TOGETHER` have a panel for each algorithm.
+    """
+    panels_of = [names]
+    if len(names) > TOGETHER:
+        panels_of = [list(group) for _, group in itertools.groupby(names, lambda name: name.partition(":")[0])]
+    figure = Figure(figsize=(WIDTH, 1.5 + 3 * len(panels_of)), layout="constrained")
+    panels = figure.subplots(len(panels_of), squeeze=False, sharex=True, sharey=True)[:, 0]
+    for axes, group in zip(panels, panels_of, strict=True):
+        axes.set_ylabel(y_label)
+        axes.grid(alpha=0.3)
+        for number, name in enumerate(group):
+            wide = table[table["configuration"] == name].pivot(index=x, columns="seed", values=y).dropna(how="all")
+            means, bands = [], []
+            for values in wide.to_numpy():
+                known = values[~np.isnan(values)]
+                means.append(stats.trim_mean(known, 0.25))
+                bands.append(bootstrap_interval(known[:, None], resamples=500))
+            _line(axes, number, name, wide.index, means, *np.transpose(bands))
+        if len(panels_of) > 1:
+            axes.legend(loc="lower right", fontsize="small")
+    panels[-1].set_xlabel(x_label)
+    if len(panels_of) == 1:
+        labels = panels[0].get_legend_handles_labels()[1]
+        beside = LEGEND_WIDTH // (6 + max(map(len, labels)))  # line and gap of an entry are as wide as six letters
+        figure.legend(loc="outside lower center", ncols=min(len(labels), max(1, beside)))
     return figure
 
 

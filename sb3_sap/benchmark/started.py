@@ -55,7 +55,7 @@ class StartedMixin:
         self.start, self.source, self.source_simulator = start, source, source_simulator
         if start != "nothing":
             kwargs |= {"learning_starts": 0, "t_k": 0}
-        if start in TAUGHT:  # critics that have seen one policy alone would lead it astray once the loss has faded
+        if start in TAUGHT:  # on design seeds they lapsed once the loss had faded
             kwargs |= {"permissibility_coef": 1.0}
         super().__init__(*args, ap_function="sb3_sap.envs.ap_function", **kwargs)  # type: ignore[call-arg]
 

@@ -28,9 +28,8 @@ class ManyActions:
 
     def __init__(self, predictor: PermissibilityPredictor, actions: th.Tensor, parts: th.Tensor | None = None):
         self.predictor, self.actions, self.parts = predictor, actions, parts
-        self._shares: list[
-            th.Tensor
-        ] = []  # (k, width) of the first layer, one for each output that sees its own inputs
+        #: (k, width) of the first layer, one for each output that sees its own inputs.
+        self._shares: list[th.Tensor] = []
         self._fitted = -1
 
     def logits(self, batches: Sequence[th.Tensor]) -> list[th.Tensor]:

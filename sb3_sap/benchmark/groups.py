@@ -97,7 +97,7 @@ GROUPS: dict[str, list[str]] = {
         )
     ],
     # The recommended use of the label, on more seeds: how many runs fail?
-    "failing": [f"{algo}:base+penalty" for algo in ("ddpg_ap", "td3_ap", "sac_ap")],
+    "failing": [f"{algo}:base+penalty" for algo in ("ddpg_ap", "td3_ap", "sac_ap", "tqc_ap")],
     # The same for PPO.
     "on_policy": [
         f"ppo_ap:{presets}"

@@ -34,7 +34,7 @@ from sb3_sap.predictor.callbacks import PermissibilityCallback
 PAIRS = (
     *("ddpg:paper", "ddpg:fast", "td3:fast", "sac:fast", "tqc:fast", "crossq:fast"),
     *("td3:fast[teaching_growth=null]", "sac:fast[teaching_growth=0]"),
-    *("td3:base+loss", "sac:base+loss"),
+    *(f"{algo}:base+loss" for algo in ("ddpg", "td3", "sac", "tqc")),
 )
 #: Bases for ``--bare``; those with discrete actions learn MountainCar, the others lane keeping on TORCS.
 BARE = ("ddpg", "td3", "sac", "tqc", "crossq", "dqn", "qrdqn")

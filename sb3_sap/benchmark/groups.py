@@ -11,6 +11,8 @@ _GUIDED = ["ddpg_ap", "td3_ap", "sac_ap", "tqc_ap", "crossq_ap"]
 #: Names of configurations by group.
 GROUPS: dict[str, list[str]] = {
     "paper": PAPER,
+    # The same with the predictor fitted by Adam, another reading of section 4.2.
+    "paper_adam": ["ddpg:paper", "ddpg_ce1:paper", "ddpg_ce2:paper", "ddpg_ap:paper_adam", "ddpg_ap_ce2:paper_adam"],
     # What a user would pick today, with the library's defaults and tuned for this task.
     "baselines": [f"{algo}:{preset}" for preset in ("default", "tuned") for algo in BASELINES],
     # Guided algorithms, with the constructor's defaults and with their fastest settings.

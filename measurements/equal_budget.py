@@ -1,0 +1,104 @@
+"""Tunes every way of using the label with the same budget: as many draws from the same grid, and a knob of its own.
+
+    python measurements/equal_budget.py ddpg_ap torcs --steps 500 --out results/tuning/equal_budget_ddpg.csv
+
+The columns are the base algorithm, the penalty, the loss and guidance. Each draws `--draws` configurations of learning
+rate, γ and exploration, with one value of its own knob; the first of them is its preset. They train with seed
+100, and the best `--again` once more with seeds 101 and 102, which decide. A run's value is the mean score over all its
+evaluations, on tracks that are not among the test tracks, so that learning sooner and ending better both count. The
+last lines are the winners, as `sb3-sap benchmark ways --configurations` reads them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from sb3_sap.benchmark.configurations import parse_configuration
+from sb3_sap.benchmark.dispatch import run_grid
+from sb3_sap.benchmark.reports.pages import write_csv
+from sb3_sap.benchmark.runs import make_run
+from sb3_sap.benchmark.store import read_result
+from sb3_sap.benchmark.task_settings import EPISODES
+from sb3_sap.evaluation.laps import ENVIRONMENTS
+
+#: Tracks that are not among the test tracks.
+TRACKS = {"torcs": ("g-track-1", "aalborg", "e-track-1"), "highway": ("random:100", "random:101", "random:102")}
+#: The grid that all columns share; algorithms whose policy is stochastic have an entropy instead of noise.
+SHARED: dict[str, list[str]] = {"learning_rate": ["0.0003", "0.001", "0.002"], "gamma": ["0.9", "0.95", "0.99"]}
+NOISE = {"action_noise": ["null", '{"type":"normal","sigma":0.1}', '{"type":"normal","sigma":0.3}']}
+ENTROPY = {"ent_coef": ["auto", "auto_0.1"]}
+#: Each column's preset and its own knob.
+OWN: dict[str, dict[str, list[str]]] = {
+    "base+penalty": {"penalty": ["auto_0.3", "auto", "auto_3"]},
+    "base+loss": {"permissibility_coef": ["lin_0.3_0.5", "lin_1.0_0.5", "lin_3.0_0.5"]},
+    "guidance": {"actor_permissibility_coef": ["1", "3"], "alpha": ["0.5", "0.9"]},
+}
+
+
+def columns(algo: str, guided: str, draws: int) -> dict[str, list[str]]:
+    """The configurations of each column, by its name; equal ones are drawn once."""
+    shared = SHARED | (NOISE if algo in ("ddpg_ap", "td3_ap") else ENTROPY)
+    found: dict[str, list[str]] = {}
+    for column, fixed in (("base", "penalty=0"), *((name, "") for name in OWN)):
+        preset = {"base": "base+penalty", "guidance": guided}.get(column, column)
+        generator = random.Random(100)  # so that all columns draw the same of what they share
+        own = random.Random(column)
+        names = [f"{algo}:{preset}" + (f"[{fixed}]" if fixed else "")]
+        while len(names) < draws:
+            chosen = {key: generator.choice(values) for key, values in shared.items()}
+            chosen |= {key: own.choice(values) for key, values in OWN.get(column, {}).items()}
+            text = ",".join([*([fixed] if fixed else []), *(f"{key}={value}" for key, value in chosen.items())])
+            names += [name for name in [parse_configuration(f"{algo}:{preset}[{text}]").name] if name not in names]
+        found[column] = names
+    return found
+
+
+def values(names: list[str], seeds: list[int], options: argparse.Namespace) -> dict[str, float]:
+    """The mean score of each configuration over seeds, evaluations and tracks."""
+    lane_keeping = options.simulator in ENVIRONMENTS
+    tracks = TRACKS[options.simulator] if lane_keeping else EPISODES
+    parsed = [parse_configuration(name) for name in names]
+    grid = {each: [make_run(each, options.simulator, options.steps, s, tracks) for s in seeds] for each in parsed}
+    run_grid(grid, options.runs, Console(), options.jobs)
+    found = {}
+    for each, runs in grid.items():
+        laps = [result["laps"] for run in runs if (result := read_result(run, options.runs)) is not None]
+        scores = [pd.DataFrame(table["data"], columns=table["columns"])["score"].mean() for table in laps]
+        found[each.name] = float(np.mean(scores)) if len(scores) == len(seeds) else float("nan")
+    return found
+
+
+def main() -> None:
+    """Writes a row for each draw and prints the winners."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("algo", help="a guided algorithm with continuous actions")
+    parser.add_argument("simulator", help=f"one of {', '.join(ENVIRONMENTS)}, or the id of a task")
+    parser.add_argument("--steps", type=int, required=True)
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--again", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where single runs are kept")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    guided = "fast" if options.simulator in ENVIRONMENTS else "task"
+    drawn = columns(options.algo, guided, options.draws)
+    first = values([name for names in drawn.values() for name in names], [100], options)
+    best = {column: sorted(names, key=lambda name: -first[name])[: options.again] for column, names in drawn.items()}
+    again = values([name for names in best.values() for name in names], [101, 102], options)
+    rows = [
+        {"column": column, "configuration": name, "seed 100": first[name], "seeds 101 and 102": again.get(name)}
+        for column, names in drawn.items()
+        for name in names
+    ]
+    write_csv(options.out, pd.DataFrame(rows).round(4))
+    print(" ".join(f"'{max(names, key=lambda name: again[name])}'" for names in best.values()))
+
+
+if __name__ == "__main__":
+    main()

@@ -280,6 +280,32 @@ def test_the_page_of_claims_says_what_was_not_run(tmp_path):
     assert "Made by `sb3-sap benchmark claims`, from 5 runs" in page
 
 
+def test_claims_of_another_reading_are_judged_by_its_runs(tmp_path):
+    results = {steps: make(tmp_path, ["paper_adam"], steps=steps) for steps in (3_000, 15_000)}
+    claims(results, tmp_path / "adam.md", "sb3-sap benchmark claims --reading paper_adam", "paper_adam")
+    claims({steps: make(tmp_path, steps=steps) for steps in results}, tmp_path / "literal.md", "command")
+    adam, literal = ((tmp_path / f"{name}.md").read_text() for name in ("adam", "literal"))
+    assert "not run" not in adam
+    assert [line for line in adam.splitlines() if line[0:1] == "|"] == [
+        line for line in literal.splitlines() if line[0:1] == "|"
+    ]  # the scores here are by algorithm
+    assert "fitted by Adam" in adam
+    assert "fitted by Adam" not in literal
+
+
+@pytest.mark.slow
+def test_pages_of_another_reading_have_names_of_their_own(tmp_path):
+    make(tmp_path, ["paper_adam"])
+    for name in ("table2_adam", "figure4_adam", "figure5_adam"):
+        assert report(tmp_path, "--configurations", "ddpg_ap:paper_adam", "ddpg:paper", name=name) == 0
+    assert report(tmp_path, name="report") == 0  # which leaves them as they are
+    found = files(tmp_path / "highway-3000")
+    assert {"table2_adam.md", "figure4a_adam.svg", "figure4b_adam.csv", "figure5_adam.svg"} <= found
+    page = (tmp_path / "highway-3000" / "figure4_adam.md").read_text()
+    assert "(figure4a_adam.svg)" in page
+    assert "(figure4b_adam.svg)" in page
+
+
 def test_ways_of_using_the_label(tmp_path):
     names = ["ddpg_ap:base+penalty[penalty=0]", "ddpg_ap:base+penalty", "ddpg_ap:base+loss", "td3_ap:base+loss"]
     ways(make(tmp_path, names, steps=1_000), tmp_path, "command")

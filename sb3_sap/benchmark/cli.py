@@ -36,7 +36,10 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     command = added.add_parser("claims", help="each result that section 5.2 of the paper states, with a verdict")
     _add_grid(command, steps=False)
     _add_workers(command)
-    command.set_defaults(run=_with_extra(actions.claims), configurations=["paper"], tracks=list(TEST_TRACKS))
+    command.add_argument(
+        "--reading", choices=list(actions.READINGS), default="paper", help="how the paper fits its AP predictor"
+    )
+    command.set_defaults(run=_with_extra(actions.claims), tracks=list(TEST_TRACKS))
     command = added.add_parser("task", help="a task beyond lane keeping: guided, its base, RL Zoo's tuned settings")
     command.add_argument("simulator", metavar="ENV_ID", help="environment with a guided algorithm in zoo_configs")
     _add_configurations(command, [])

@@ -24,6 +24,12 @@ REPORTS = {
     "table2": (["paper"], "Table 2 of the paper beside our figures"),
     "figure4": (["paper"], "Figures 4a and 4b: reward during training"),
     "figure5": (["ddpg_ap:paper", "ddpg_ap_ce2:paper", "ddpg_ap:default"], "Figure 5: accuracy of the AP predictor"),
+    "table2_adam": (["paper_adam"], "Table 2, with the AP predictor fitted by Adam"),
+    "figure4_adam": (["paper_adam"], "Figures 4a and 4b, with the AP predictor fitted by Adam"),
+    "figure5_adam": (
+        ["ddpg_ap:paper_adam", "ddpg_ap_ce2:paper_adam", "ddpg_ap:paper"],
+        "Figure 5, with the AP predictor fitted by Adam",
+    ),
     "curve": (["all"], "S and laps on the test tracks over training steps"),
     "summary": (["all"], "statistics of all configurations, and how probably one improves on another"),
     "headline": (["headline"], "the table of the README: S and laps after 250, 500, 1,000 and 3,000 steps"),
@@ -46,6 +52,8 @@ WAYS = ("ways", "failing", "on_policy", "wrong_labels", "starts")
 LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.
 PAPER_STEPS = (3_000, 15_000)
+#: Readings of how the paper fits its predictor, as groups of configurations, and the file of their claims.
+READINGS = {"paper": "claims", "paper_adam": "claims-adam"}
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -75,6 +83,7 @@ def task(options: argparse.Namespace, console: Console) -> int:
 
 def claims(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of the paper's experiments and judges its claims."""
+    options.configurations = [options.reading]
     failed = sum(_run_missing(options, steps, console) for steps in PAPER_STEPS)
     _write_claims(options, console)
     return int(failed > 0)
@@ -86,14 +95,16 @@ def report_all(options: argparse.Namespace, console: Console) -> int:
 
     written = 0
     for name, (configurations, _) in REPORTS.items():
+        if name.endswith("_adam"):  # whose seeds are others
+            continue
         options.configurations, options.report = configurations, name
         try:
             _write(options, name, console, leave_out_unknown=True)
             written += 1
         except NoResults as error:
             console.print(f"{name} is left out: {error}", soft_wrap=True, markup=False)
-    options.configurations, options.report = ["paper"], "claims"
     if written:
+        options.report, options.reading = "claims", "paper"
         _write_claims(options, console)
     return int(written == 0)
 
@@ -126,9 +137,9 @@ def _write(options: argparse.Namespace, name: str, console: Console, leave_out_u
     grid = _grid(options, options.steps, console if leave_out_unknown else None)
     results = collect(grid, folder, options.simulator, options.steps)
     writers: dict[str, Callable[[Results, Path, str], None]] = {
-        "table2": tables.table_2,
-        "figure4": figures.figure_4,
-        "figure5": figures.figure_5,
+        **{kind: partial(tables.table_2, name=kind) for kind in ("table2", "table2_adam")},
+        **{kind: partial(figures.figure_4, name=kind) for kind in ("figure4", "figure4_adam")},
+        **{kind: partial(figures.figure_5, name=kind) for kind in ("figure5", "figure5_adam")},
         "curve": figures.curve,
         "headline": tables.headline,
         **{kind: partial(summary.summary, name=kind) for kind in SUMMARIES},
@@ -143,15 +154,16 @@ def _write_claims(options: argparse.Namespace, console: Console) -> None:
     from sb3_sap.benchmark.reports.claims import claims
     from sb3_sap.benchmark.reports.results import NoResults, collect
 
+    options.configurations = [options.reading]
     found = {}
     for steps in PAPER_STEPS:
         try:
             found[steps] = collect(_grid(options, steps), _folder(options, steps), options.simulator, steps)
         except NoResults:
             continue
-    path = options.out / f"{options.simulator}-claims.md"
+    path = options.out / f"{options.simulator}-{READINGS[options.reading]}.md"
     if found:
-        claims(found, path, command_line(options, "claims"))
+        claims(found, path, command_line(options, "claims"), options.reading)
         console.print(f"wrote {path}", soft_wrap=True)
 
 
@@ -196,7 +208,9 @@ def command_line(options: argparse.Namespace, name: str) -> str:
     words += [] if name == "claims" else ["--steps", str(options.steps)]
     words += ["--seeds", str(options.seeds)]
     words += ["--first-seed", str(options.first_seed)] if options.first_seed else []
-    default = REPORTS[name][0] if name in REPORTS and not beyond else ["paper"]
-    words += ["--configurations", *options.configurations] if options.configurations != default else []
+    if name == "claims":
+        words += ["--reading", options.reading] if options.reading != "paper" else []
+    elif options.configurations != (REPORTS[name][0] if name in REPORTS and not beyond else ["paper"]):
+        words += ["--configurations", *options.configurations]
     words += ["--tracks", *options.tracks] if not beyond and options.tracks != list(TEST_TRACKS) else []
     return shlex.join(words)

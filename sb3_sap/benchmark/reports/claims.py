@@ -23,6 +23,10 @@ DEFINITIONS = f"""All figures are those of the paper's five algorithms with the 
   off the road or facing backwards.
 """
 
+ADAM = """The predictors of DDPG-AP and DDPG-(AP+CE2) are fitted by Adam and without weight decay, the preset
+`paper_adam`.
+"""
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -163,12 +167,15 @@ def judged(results: dict[int, Results]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["the paper says", "steps", "reproduced if", "ours", "verdict"])
 
 
-def claims(results: dict[int, Results], path: Path, command: str) -> None:
+def claims(results: dict[int, Results], path: Path, command: str, reading: str = "paper") -> None:
     """Writes the page of all claims.
 
     :param results: by training steps
+    :param reading: the preset of the configurations with a predictor: ``"paper"`` or ``"paper_adam"``
     """
     simulator = next(iter(results.values())).simulator
     made = [f"{steps:,} steps. {made_by(found, command)}" for steps, found in results.items()]
     title = f"# The claims of section 5.2 ({simulator})\n"
-    write_text(path, "\n".join([title, DEFINITIONS, markdown(judged(results)), *made]))
+    parts = [title, DEFINITIONS, *([ADAM] if reading == "paper_adam" else [])]
+    table = judged({steps: found.renamed(reading, "paper") for steps, found in results.items()})
+    write_text(path, "\n".join([*parts, markdown(table), *made]))

@@ -18,46 +18,51 @@ ACCURACY_STEPS = 5_000
 BAND = "The line is the interquartile mean over seeds, and the band is its 95 % bootstrap interval.\n"
 
 
-def figure_4(results: Results, folder: Path, command: str) -> None:
-    """Writes ``figure4.md``, and figures 4a and 4b as SVG and CSV."""
-    write_csv(folder / "figure4a.csv", results.curve[["configuration", "seed", "step", "reward"]])
+def figure_4(results: Results, folder: Path, command: str, name: str = "figure4") -> None:
+    """Writes the page, and figures 4a and 4b as SVG and CSV.
+
+    :param name: of the page, with which the names of the other files agree
+    """
+    suffix = name.removeprefix("figure4")
+    a, b = f"figure4a{suffix}", f"figure4b{suffix}"
+    write_csv(folder / f"{a}.csv", results.curve[["configuration", "seed", "step", "reward"]])
     episodes = with_averages(results.episodes)
-    write_csv(folder / "figure4b.csv", episodes)
-    a = line_figure(
+    write_csv(folder / f"{b}.csv", episodes)
+    averages = line_figure(
         results.curve, results.names, "step", "reward", "training step", "reward, mean of the last 100 steps"
     )
-    write_figure(folder / "figure4a.svg", a)
-    write_figure(folder / "figure4b.svg", episodes_figure(episodes, results.names))
+    write_figure(folder / f"{a}.svg", averages)
+    write_figure(folder / f"{b}.svg", episodes_figure(episodes, results.names))
     parts = [
-        "## 4a: average reward over the last 100 training steps\n\n![Figure 4a](figure4a.svg)\n",
+        f"## 4a: average reward over the last 100 training steps\n\n![Figure 4a]({a}.svg)\n",
         BAND,
-        "## 4b: average reward of each training episode\n\n![Figure 4b](figure4b.svg)\n",
+        f"## 4b: average reward of each training episode\n\n![Figure 4b]({b}.svg)\n",
         "Each line is the reward per step in the episodes of one training run, which ends at the dot. A run that stays "
         "on the road has few episodes, because an episode lasts until the car leaves the road.\n",
     ]
-    write_page(
-        folder / "figure4.md", f"Figure 4 ({results.simulator}, {results.steps:,} steps)", parts, results, command
-    )
+    title = f"Figure 4 ({results.simulator}, {results.steps:,} steps)"
+    write_page(folder / f"{name}.md", title, parts, results, command)
 
 
-def figure_5(results: Results, folder: Path, command: str) -> None:
-    """Writes ``figure5.md``, and the figure as SVG and CSV.
+def figure_5(results: Results, folder: Path, command: str, name: str = "figure5") -> None:
+    """Writes the page, and the figure as SVG and CSV.
 
+    :param name: of all three
     :raise NoResults: if no configuration has an AP predictor
     """
     curve = results.curve[results.curve["accuracy"].notna() & (results.curve["step"] <= ACCURACY_STEPS)]
     if curve.empty:
         raise NoResults("none of these configurations has an AP predictor.")
     curve = curve.astype({"accuracy": float, "lowest_accuracy": float})
-    write_csv(folder / "figure5.csv", curve.drop(columns="reward"))
+    write_csv(folder / f"{name}.csv", curve.drop(columns="reward"))
     names = [name for name in results.names if (curve["configuration"] == name).any()]
     figure = line_figure(curve, names, "step", "accuracy", "training step", "balanced validation accuracy of E")
     figure.axes[0].axhline(SUFFICIENT_ACCURACY, color="0.5", linestyle=":")
-    write_figure(folder / "figure5.svg", figure)
+    write_figure(folder / f"{name}.svg", figure)
     note = "The dotted line is the accuracy of 70 % from which α has its full value.\n"
-    parts = ["![Figure 5](figure5.svg)\n", BAND, note]
+    parts = [f"![Figure 5]({name}.svg)\n", BAND, note]
     title = f"Figure 5: validation accuracy of the AP predictor ({results.simulator})"
-    write_page(folder / "figure5.md", title, parts, results.only(names), command)
+    write_page(folder / f"{name}.md", title, parts, results.only(names), command)
 
 
 def curve(results: Results, folder: Path, command: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,13 @@ class Results:
         configurations = [configuration for configuration in self.configurations if configuration.name in names]
         missing = {name: number for name, number in self.missing.items() if name in names}
         return Results(self.simulator, self.steps, configurations, missing, made=self.made, **kept)
+
+    def renamed(self, old: str, new: str) -> Results:
+        """The same results, as if those with a preset had another one."""
+        names = {each.name: replace(each, preset=new).name for each in self.configurations if each.preset == old}
+        tables = {table: getattr(self, table).replace({"configuration": names}) for table in TABLES}
+        configurations = [replace(each, preset=new) if each.preset == old else each for each in self.configurations]
+        return replace(self, configurations=configurations, **tables)
 
 
 def collect(grid: dict[Configuration, list[Run]], folder: Path, simulator: str, steps: int) -> Results:

@@ -23,10 +23,13 @@ NOTE = (
 HEADLINE = (250, 500, 1_000, 3_000)
 
 
-def table_2(results: Results, folder: Path, command: str) -> None:
-    """Writes ``table2.md`` and ``table2.csv``."""
+def table_2(results: Results, folder: Path, command: str, name: str = "table2") -> None:
+    """Writes the page, and its data as CSV.
+
+    :param name: of both
+    """
     laps = results.final_laps()
-    write_csv(folder / "table2.csv", laps)
+    write_csv(folder / f"{name}.csv", laps)
     rows = [
         _table_2_row(laps, configuration, track, results.steps)
         for track in dict.fromkeys(laps["track"])
@@ -35,7 +38,7 @@ def table_2(results: Results, folder: Path, command: str) -> None:
     title = (
         f"Table 2: one lap of each test track after {results.steps:,} training steps on Wheel-2 ({results.simulator})"
     )
-    write_page(folder / "table2.md", title, [markdown(pd.DataFrame(rows)), NOTE], results, command)
+    write_page(folder / f"{name}.md", title, [markdown(pd.DataFrame(rows)), NOTE], results, command)
 
 
 def _table_2_row(laps: pd.DataFrame, configuration: Configuration, track: str, steps: int) -> dict[str, str]:

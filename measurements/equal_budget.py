@@ -2,11 +2,11 @@
 
     python measurements/equal_budget.py ddpg_ap torcs --steps 500 --out results/tuning/equal_budget_ddpg.csv
 
-The columns are the base algorithm, the penalty, the loss and guidance. Each draws `--draws` configurations of learning
-rate, γ and exploration, with one value of its own knob; the first of them is its preset. They train with seed
-100, and the best `--again` once more with seeds 101 and 102, which decide. A run's value is the mean score over all its
-evaluations, on tracks that are not among the test tracks, so that learning sooner and ending better both count. The
-last lines are the winners, as `sb3-sap benchmark ways --configurations` reads them.
+The columns are the base algorithm, shaping by a potential, the penalty, the loss and guidance. Each draws `--draws`
+configurations of learning rate, γ and exploration, with a value of its own knob; the first of them is its preset. They
+train with seed 100, and the best `--again` once more with seeds 101 and 102, which decide. A run's value is the mean
+score over all its evaluations, on tracks that are not among the test tracks, so that learning sooner and ending better
+both count. The last line has the winners, as `sb3-sap benchmark ways --configurations` reads them.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import random
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -33,30 +34,51 @@ TRACKS = {"torcs": ("g-track-1", "aalborg", "e-track-1"), "highway": ("random:10
 SHARED: dict[str, list[str]] = {"learning_rate": ["0.0003", "0.001", "0.002"], "gamma": ["0.9", "0.95", "0.99"]}
 NOISE = {"action_noise": ["null", '{"type":"normal","sigma":0.1}', '{"type":"normal","sigma":0.3}']}
 ENTROPY = {"ent_coef": ["auto", "auto_0.1"]}
-#: Each column's preset and its own knob.
-OWN: dict[str, dict[str, list[str]]] = {
-    "base+penalty": {"penalty": ["auto_0.3", "auto", "auto_3"]},
-    "base+loss": {"permissibility_coef": ["lin_0.3_0.5", "lin_1.0_0.5", "lin_3.0_0.5"]},
-    "guidance": {"actor_permissibility_coef": ["1", "3"], "alpha": ["0.5", "0.9"]},
+#: The potentials of each task, of which the second is tried first.
+POTENTIALS = {
+    **{simulator: [f"sb3_sap.benchmark.potentials.centre_{size}" for size in (30, 100, 300)] for simulator in TRACKS},
+    "MountainCarContinuous-v0": [f"sb3_sap.benchmark.potentials.energy_{size}" for size in (1, 10, 100)],
 }
 
 
-def columns(algo: str, guided: str, draws: int) -> dict[str, list[str]]:
-    """The configurations of each column, by its name; equal ones are drawn once."""
+class Column(NamedTuple):
+    """A way of using the label: its preset, what the first draw and what all draws change in it, and its own knobs."""
+
+    preset: str
+    first: str
+    always: str
+    knobs: dict[str, list[str]]
+
+
+def columns(simulator: str) -> dict[str, Column]:
+    """The ways that are compared, by name."""
+    guided = "fast" if simulator in ENVIRONMENTS else "task"
+    potentials = POTENTIALS[simulator]
+    loss = {"permissibility_coef": ["lin_0.3_0.5", "lin_1.0_0.5", "lin_3.0_0.5"]}
+    guidance = {"actor_permissibility_coef": ["1", "3"], "alpha": ["0.5", "0.9"]}
+    return {
+        "base": Column("base+penalty", "penalty=0", "penalty=0,", {}),
+        "shaping": Column(
+            "base+penalty", f"penalty=0,potential={potentials[1]}", "penalty=0,", {"potential": potentials}
+        ),
+        "penalty": Column("base+penalty", "", "", {"penalty": ["auto_0.3", "auto", "auto_3"]}),
+        "loss": Column("base+loss", "", "", loss),
+        "guidance": Column(guided, "", "", guidance),
+    }
+
+
+def draws(algo: str, column: Column, number: int) -> list[str]:
+    """Names of configurations, the preset first; equal ones are drawn once."""
     shared = SHARED | (NOISE if algo in ("ddpg_ap", "td3_ap") else ENTROPY)
-    found: dict[str, list[str]] = {}
-    for column, fixed in (("base", "penalty=0"), *((name, "") for name in OWN)):
-        preset = {"base": "base+penalty", "guidance": guided}.get(column, column)
-        generator = random.Random(100)  # so that all columns draw the same of what they share
-        own = random.Random(column)
-        names = [f"{algo}:{preset}" + (f"[{fixed}]" if fixed else "")]
-        while len(names) < draws:
-            chosen = {key: generator.choice(values) for key, values in shared.items()}
-            chosen |= {key: own.choice(values) for key, values in OWN.get(column, {}).items()}
-            text = ",".join([*([fixed] if fixed else []), *(f"{key}={value}" for key, value in chosen.items())])
-            names += [name for name in [parse_configuration(f"{algo}:{preset}[{text}]").name] if name not in names]
-        found[column] = names
-    return found
+    same, own = random.Random(100), random.Random(200)  # all columns draw the same of what they share
+    text = f"[{column.first}]" if column.first else ""
+    names: list[str] = []
+    while len(names) < number:
+        names += [name for name in [parse_configuration(f"{algo}:{column.preset}{text}").name] if name not in names]
+        chosen = {key: same.choice(values) for key, values in shared.items()}
+        chosen |= {key: own.choice(values) for key, values in column.knobs.items()}
+        text = f"[{column.always}{','.join(f'{key}={value}' for key, value in chosen.items())}]"
+    return names
 
 
 def values(names: list[str], seeds: list[int], options: argparse.Namespace) -> dict[str, float]:
@@ -86,8 +108,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where single runs are kept")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    guided = "fast" if options.simulator in ENVIRONMENTS else "task"
-    drawn = columns(options.algo, guided, options.draws)
+    drawn = {name: draws(options.algo, column, options.draws) for name, column in columns(options.simulator).items()}
     first = values([name for names in drawn.values() for name in names], [100], options)
     best = {column: sorted(names, key=lambda name: -first[name])[: options.again] for column, names in drawn.items()}
     again = values([name for names in best.values() for name in names], [101, 102], options)

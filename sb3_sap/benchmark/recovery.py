@@ -32,8 +32,8 @@ WINDOW = 500
 class SACRecovery(SACAP):
     """SAC with the multiplier of RCPO and the safety critic of Recovery RL, for one environment and an AP function.
 
-    :param risk_threshold: ε, the risk above which the recovery policy acts; 1: never
-    :param risk_gamma: γ_risk
+    :param recovery_threshold: ε, the risk above which the recovery policy acts; 1: never
+    :param critic_discount: γ_risk
     :param mistake_bound: the share of mistakes that the multiplier aims at
     :param multiplier_rate: change of the multiplier at each step, for a share of 1 above the bound
     """
@@ -41,13 +41,13 @@ class SACRecovery(SACAP):
     def __init__(
         self,
         *args: Any,
-        risk_threshold: float = 0.7,
-        risk_gamma: float = 0.5,
+        recovery_threshold: float = 0.7,
+        critic_discount: float = 0.5,
         mistake_bound: float = 0.1,
         multiplier_rate: float = 0.01,
         **kwargs: Any,
     ):
-        self.risk_threshold, self.risk_gamma = risk_threshold, risk_gamma
+        self.recovery_threshold, self.critic_discount = recovery_threshold, critic_discount
         self.mistake_bound, self.multiplier_rate = mistake_bound, multiplier_rate
         self.multiplier = 0.0
         self._mistakes: deque[int] = deque(maxlen=WINDOW)
@@ -57,26 +57,28 @@ class SACRecovery(SACAP):
         super()._setup_model()
         inputs = self.predictor.features_extractor.features_dim + int(np.prod(cast(Any, self.action_space.shape)))
         with own_generators(self.seed or 0, self.device):
-            self.risk = nn.Sequential(*create_mlp(inputs, 1, [64, 64])).to(self.device)
-        self.risk_optimizer = th.optim.Adam(self.risk.parameters(), lr=1e-3)
+            self.safety_critic = nn.Sequential(*create_mlp(inputs, 1, [64, 64])).to(self.device)
+        self.safety_critic_optimizer = th.optim.Adam(self.safety_critic.parameters(), lr=1e-3)
 
-    def _risk(self, obs: Any, actions: th.Tensor) -> th.Tensor:
+    def _critic_risk(self, obs: Any, actions: th.Tensor) -> th.Tensor:
         """(n,) logits of the risk; E's extractor only flattens."""
-        return cast(th.Tensor, self.risk(th.cat([self.predictor.features(obs), actions], dim=1))).squeeze(1)
+        return cast(th.Tensor, self.safety_critic(th.cat([self.predictor.features(obs), actions], dim=1))).squeeze(1)
 
     @th.no_grad()
     def guide(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any] | None:
         """Replaces what is too risky by the least risky candidate."""
         obs, _ = self.policy.obs_to_tensor(cast(Any, self._last_obs))
         everywhere = np.arange(len(actions))
-        risk = th.sigmoid(self._risk(obs, th.as_tensor(actions, device=self.device))).cpu().numpy()
-        risky = np.flatnonzero(risk > self.risk_threshold)
+        risk = th.sigmoid(self._critic_risk(obs, th.as_tensor(actions, device=self.device))).cpu().numpy()
+        risky = np.flatnonzero(risk > self.recovery_threshold)
         if len(risky) == 0:
             return None
         candidates, _ = self.sample_candidates(everywhere[risky], len(actions))
         m, n, dim = candidates.shape
         repeated = rows_of(obs, np.repeat(risky, n))
-        risks = self._risk(repeated, th.as_tensor(candidates.reshape(m * n, dim), device=self.device)).reshape(m, n)
+        risks = self._critic_risk(repeated, th.as_tensor(candidates.reshape(m * n, dim), device=self.device)).reshape(
+            m, n
+        )
         recovered = actions.copy()
         recovered[risky] = candidates[np.arange(m), risks.argmin(dim=1).cpu().numpy()]
         return recovered
@@ -89,9 +91,9 @@ class SACRecovery(SACAP):
         buffer.shaping = RewardShaping(self.multiplier * float(buffer.reward_scale), None, self.gamma)
         super().train(gradient_steps, batch_size)
         for _ in range(gradient_steps):
-            self._update_risk(buffer)
+            self._update_critic(buffer)
 
-    def _update_risk(self, buffer: KnowledgeMixin) -> None:
+    def _update_critic(self, buffer: KnowledgeMixin) -> None:
         """One step of the safety critic, on a batch whose mistakes the AP function tells."""
         data: Any = buffer.sample(self.batch_size)
         before, after = (_arrays(side) for side in (data.observations, data.next_observations))
@@ -100,12 +102,12 @@ class SACRecovery(SACAP):
         mistake = th.as_tensor(~permissible, dtype=th.float32, device=self.device)
         with th.no_grad():
             proposed, _ = self.actor.action_log_prob(data.next_observations)
-            later = th.sigmoid(self._risk(data.next_observations, proposed)) * (1 - data.dones.squeeze(1))
-            target = mistake + (1 - mistake) * self.risk_gamma * later
-        loss = F.binary_cross_entropy_with_logits(self._risk(data.observations, data.actions), target)
-        self.risk_optimizer.zero_grad()
+            later = th.sigmoid(self._critic_risk(data.next_observations, proposed)) * (1 - data.dones.squeeze(1))
+            target = mistake + (1 - mistake) * self.critic_discount * later
+        loss = F.binary_cross_entropy_with_logits(self._critic_risk(data.observations, data.actions), target)
+        self.safety_critic_optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        self.risk_optimizer.step()
+        self.safety_critic_optimizer.step()
 
 
 def _arrays(observations: Any) -> Any:

@@ -56,11 +56,12 @@ def preset_names(algo: str | type) -> list[str]:
 
 
 def preset(name: str, algo: str | type | None = None, steps: int | None = None) -> dict[str, Any]:
-    """Constructor arguments: ``TQCAP("MlpPolicy", env, **preset("fast", TQCAP))``.
+    """Constructor arguments: ``TQCAP("MlpPolicy", env, **preset("penalty", TQCAP))``.
 
-    :param name: ``"paper"``, the values of section 5.1; ``"paper_adam"``, the same with E fitted by Adam;
-        ``"fast"``, the settings that learn lane keeping fastest;
-        ``"tuned"``, the best settings of a baseline on lane keeping; or ``"default"``, those of the constructor
+    :param name: ``"penalty"``, the label as a reward penalty; ``"loss"``, a loss on the predictor beside it;
+        ``"default"``, the constructor's settings, which guide; ``"paper"``, the values of section 5.1;
+        ``"paper_adam"``, the same with E fitted by Adam; ``"tuned"``, the best settings of a baseline on lane keeping;
+        ``"fast"``, the same with guidance
     :param algo: the algorithm, a class of this package, one derived from it, or its RL Zoo name. ``None``: DDPG-AP,
         for the paper's presets only
     :param steps: planned timesteps of the training: a short one may have settings of its own. ``None``: a long one

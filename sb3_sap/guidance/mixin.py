@@ -24,7 +24,10 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
         GuidedExplorationMixin       Algorithm 1
         LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E
         LearnedRiskMixin             E as a discounted probability of an event
-        PriorKnowledgeMixin          transitions and predictors of elsewhere
+        PriorKnowledgeMixin          a predictor of elsewhere
+        ImportMixin                  transitions of elsewhere
+        KnownExamplesMixin           batches of them
+        FamiliarityMixin             whether they fit
         LearnedPredictorMixin        settings of K and E, saving of E
         WatchedEnvironmentMixin      raw last observations, warnings about the training environment
         ConstrainedExplorationMixin  constraints and permissible actions
@@ -44,6 +47,8 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
     :class:`~sb3_sap.predictor.mixin.LearnedPermissibilityMixin`,
     :class:`~sb3_sap.predictor.risk_mixin.LearnedRiskMixin`,
     :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin`,
+    :class:`~sb3_sap.predictor.importing.ImportMixin`,
+    :class:`~sb3_sap.predictor.familiar.FamiliarityMixin`,
     :class:`~sb3_sap.predictor.learned.LearnedPredictorMixin`,
     :class:`~sb3_sap.guidance.constrained.ConstrainedExplorationMixin`,
     :class:`~sb3_sap.guidance.jump_start.JumpStartMixin` and

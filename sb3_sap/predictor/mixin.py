@@ -14,12 +14,12 @@ from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.predictor.buffers import KnowledgeMixin, check_fits
 from sb3_sap.predictor.building import make_replay_buffer
 from sb3_sap.predictor.callbacks import PermissibilityCallback, contains_permissibility_callback
+from sb3_sap.predictor.importing import Into
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
 from sb3_sap.predictor.labelling import Labels
 from sb3_sap.predictor.prior_replay import PriorReplay
 from sb3_sap.predictor.risk_mixin import LearnedRiskMixin
 from sb3_sap.predictor.schedule import check_growth, due
-from sb3_sap.predictor.transfer import Into
 from sb3_sap.transitions.sources import number_of_rows
 
 

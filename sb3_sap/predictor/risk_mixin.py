@@ -13,11 +13,12 @@ from sb3_sap.common.arrays import FloatArray, Observations
 from sb3_sap.common.errors import is_number
 from sb3_sap.common.random import make_rng
 from sb3_sap.common.torch_utils import own_generators
+from sb3_sap.predictor.importing import Into
 from sb3_sap.predictor.knowledge import LabelledActions
 from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.reports import KnowledgeReport, PredictorReport
 from sb3_sap.predictor.risk import RiskKnowledge, RiskTarget, steps_at_risk
-from sb3_sap.predictor.transfer import Into, PriorKnowledgeMixin
+from sb3_sap.predictor.transfer import PriorKnowledgeMixin
 
 
 class LearnedRiskMixin(PriorKnowledgeMixin):

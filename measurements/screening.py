@@ -27,7 +27,7 @@ from torch.nn import functional as F
 from sb3_sap import DDPGAP, DQNAP, SACAP, TD3AP, RescaleExtractor, preset, tasks
 from sb3_sap.evaluation import drive_lap
 from sb3_sap.guidance.values import q_values
-from sb3_sap.predictor.network import query_candidates
+from sb3_sap.predictor.pairs import query_candidates
 from sb3_sap.presets import load_config, settings_in
 
 

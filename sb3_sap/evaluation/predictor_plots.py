@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_sap.common.arrays import FloatArray, Observations
-from sb3_sap.predictor.network import query_candidates
+from sb3_sap.predictor.pairs import query_candidates
 
 #: Points along each axis of a picture.
 RESOLUTION = 121

@@ -11,7 +11,7 @@ from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
 from sb3_sap.guidance.candidates import candidate_actions, choose, only_in
 from sb3_sap.guidance.masks import check_statistics
-from sb3_sap.predictor.network import query_candidates
+from sb3_sap.predictor.pairs import query_candidates
 
 
 class GuidedPolicy:

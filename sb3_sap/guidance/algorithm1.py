@@ -17,7 +17,7 @@ from sb3_sap.guidance.candidates import SELECTIONS, choose, only_in
 from sb3_sap.guidance.constrained import ConstrainedExplorationMixin
 from sb3_sap.guidance.values import q_values
 from sb3_sap.predictor.mixin import LearnedPermissibilityMixin
-from sb3_sap.predictor.network import query_candidates
+from sb3_sap.predictor.pairs import query_candidates
 
 
 class GuidedExplorationMixin(LearnedPermissibilityMixin, ConstrainedExplorationMixin):

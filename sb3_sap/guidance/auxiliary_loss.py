@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.values import action_values
 from sb3_sap.predictor.network import PermissibilityPredictor
+from sb3_sap.predictor.pairs import judge
 
 
 @flush_denormals()
@@ -95,8 +96,7 @@ def preference_loss(model: Any, predictor: PermissibilityPredictor, observations
     n, k = values.shape
     with th.no_grad():
         actions = th.arange(k, device=values.device).repeat(n, 1)
-        features = predictor.features(observations).repeat_interleave(k, dim=0)
-        rejected = (predictor.logits(features, actions.flatten()) <= 0).reshape(n, k)
+        rejected = judge(predictor, predictor.features(observations), actions[:, :, None]) <= 0
     best = values.masked_fill(rejected, -th.inf).max(dim=1, keepdim=True).values
     separated = rejected & best.isfinite()
     if not separated.any():

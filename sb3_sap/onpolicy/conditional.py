@@ -17,6 +17,7 @@ from sb3_sap.onpolicy.enumerated import PAIRS_AT_ONCE, within
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.masks import log_probs_of_dimensions, masked_categorical
 from sb3_sap.onpolicy.states import Remembered, keys_of, keys_with
+from sb3_sap.predictor.pairs import judge
 
 #: Maximum number of combinations of a block of dimensions, each of which E judges.
 BLOCK = 256
@@ -116,9 +117,9 @@ class ConditionalGuide(Guide):
         assert self.predictor is not None
         m, at_once, found = len(block), max(1, PAIRS_AT_ONCE // len(block)), []
         for some_features, some in zip(th.split(features, at_once), th.split(actions, at_once), strict=True):
-            varied = some.repeat_interleave(m, dim=0)
-            varied[:, block.dimensions] = block.choices.repeat(len(some), 1)
-            found.append(self.predictor.logits(some_features.repeat_interleave(m, dim=0), varied).reshape(-1, m) > 0)
+            varied = some[:, None].repeat(1, m, 1)
+            varied[:, :, block.dimensions] = block.choices
+            found.append(judge(self.predictor, some_features, varied) > 0)
         return th.cat(found).cpu().numpy()
 
     def _completion(self, states: list[bytes], distribution: Distribution) -> th.Tensor:

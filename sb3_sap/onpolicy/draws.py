@@ -17,6 +17,7 @@ from sb3_sap.guidance.candidates import stratified_candidates
 from sb3_sap.onpolicy.bounds import Bounds
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.states import Remembered, keys_of
+from sb3_sap.predictor.pairs import judge
 
 
 class DrawingGuide(Guide):
@@ -132,9 +133,8 @@ class DrawingGuide(Guide):
         """(m, N) bool, which of N actions in m states E permits."""
         assert self.predictor is not None
         m, n, dim = candidates.shape
-        executed = self.bounds.executed(candidates.reshape(m * n, dim))
-        repeated = features.expand(n, -1) if m == 1 else features.repeat_interleave(n, dim=0)
-        return self.predictor.logits(repeated, executed).reshape(m, n) > 0
+        executed = self.bounds.executed(candidates.reshape(m * n, dim)).reshape(m, n, dim)
+        return judge(self.predictor, features, executed) > 0
 
     def _draws(self, distribution: Any) -> tuple[th.Tensor, th.Tensor]:
         """(n, N - 1, action_dim) further draws, before they are squashed, and their log-densities, (n, N - 1)."""

@@ -14,12 +14,11 @@ from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_log_probs
 from sb3_sap.onpolicy.states import Remembered, keys_of
-from sb3_sap.predictor.pairs import ManyActions
+from sb3_sap.predictor.encoding import MANY_ACTIONS
+from sb3_sap.predictor.pairs import ManyActions, judge
 
 #: Maximum number of pairs of a state and an action that E judges at once, which bounds the memory of its layers.
 PAIRS_AT_ONCE = 32_768
-#: Number of actions from which their share of E's first layer is computed once for all states.
-MANY_ACTIONS = 64
 
 
 class EnumeratedGuide(Guide):
@@ -34,8 +33,9 @@ class EnumeratedGuide(Guide):
         #: (k, action_dim) every action.
         self.actions = th.as_tensor(actions.reshape(len(actions), -1).astype(np.int64), device=self.device)
         self._verdicts = Remembered()
-        predictor, many = self.predictor, len(self.actions) >= MANY_ACTIONS
-        self._many = ManyActions(predictor, self.actions) if predictor is not None and many else None
+        # Few actions are judged faster by a pass for each pair.
+        many = self.predictor is not None and len(self.actions) >= MANY_ACTIONS
+        self._many = ManyActions(self.predictor, self.actions) if self.predictor is not None and many else None
 
     def distribution(self, obs: Any, distribution: Distribution, executed: th.Tensor | None = None) -> Distribution:
         mask = self.mask(obs)
@@ -75,8 +75,7 @@ class EnumeratedGuide(Guide):
         if self._many is not None:
             logits = self._many.logits(batches)
         else:
-            pairs = ((batch.repeat_interleave(k, dim=0), self.actions.repeat(len(batch), 1)) for batch in batches)
-            logits = [self.predictor.logits(*pair).reshape(-1, k) for pair in pairs]
+            logits = [judge(self.predictor, batch, self.actions.expand(len(batch), -1, -1)) for batch in batches]
         return within((th.cat(logits) > 0).cpu().numpy(), None)
 
 

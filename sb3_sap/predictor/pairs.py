@@ -1,24 +1,53 @@
-"""E's judgement of the same finite actions in many states.
-
-Of the first layer, whose inputs are mostly those of a one-hot action, features and actions have their shares once: for
-many actions that is far faster than a pass for each pair. The logits differ by rounding alone.
-"""
+"""E's judgement of several actions in each of several states."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, cast
 
+import numpy as np
 import torch as th
-from gymnasium import spaces
 from torch.nn import functional as F
 
+from sb3_sap.common.arrays import FloatArray
 from sb3_sap.predictor.encoding import encoded_actions
 from sb3_sap.predictor.network import PermissibilityPredictor
 
 
+def judge(
+    predictor: PermissibilityPredictor, features: th.Tensor, actions: th.Tensor, part: int | None = None
+) -> th.Tensor:
+    """(m, n) logits of n actions in each of m states, in one call; above zero means permissible.
+
+    :param features: (m, features_dim)
+    :param actions: (m, n, action_dim), scaled
+    :param part: the part of the action that is judged; None: the whole
+    """
+    m, n = actions.shape[:2]
+    if predictor.has_outputs_of_actions:
+        return predictor.head(features).gather(1, actions.reshape(m, n).long()) - predictor.offset  # type: ignore[no-any-return]
+    pairs = features.expand(n, -1) if m == 1 else features.repeat_interleave(n, dim=0), actions.reshape(m * n, -1)
+    logits = predictor.logits(*pairs) if part is None else predictor.part_logits(*pairs)[:, part]
+    return logits.reshape(m, n)
+
+
+def query_candidates(
+    predictor: PermissibilityPredictor,
+    features: th.Tensor,
+    candidates: np.ndarray[Any, Any],
+    part: int | None = None,
+) -> FloatArray:
+    """The same of (m, n, action_dim) candidates that are no tensors."""
+    actions = th.as_tensor(candidates, device=features.device)
+    return judge(predictor, features, actions, part).cpu().numpy()
+
+
 class ManyActions:
-    """Many actions, whose share of E's first layer is computed again only after E was fitted.
+    """The same finite actions in many states.
+
+    Of E's first layer, whose inputs are mostly those of a one-hot action, features and actions have their shares once,
+    and that of the actions is computed again only after E was fitted: for many actions this is far faster than a pass
+    for each pair. The logits differ by rounding alone.
 
     :param predictor: E
     :param actions: (k, action_dim), scaled
@@ -37,6 +66,9 @@ class ManyActions:
 
         :param batches: (n, features_dim) features
         """
+        if self.predictor.has_outputs_of_actions:
+            chosen = self.actions.flatten().long()
+            return [self.predictor.head(batch)[:, chosen] - self.predictor.offset for batch in batches]
         if self._fitted != int(self.predictor.n_updates):
             self._shares, self._fitted = self._shares_now(), int(self.predictor.n_updates)
         found: Iterable[th.Tensor]
@@ -57,8 +89,6 @@ class ManyActions:
     def _shares_now(self) -> list[th.Tensor]:
         space, own = self.predictor.action_space, self.predictor.own_inputs
         of_actions = self._first.weight[:, -self._first_inputs :]
-        if isinstance(space, spaces.Discrete):
-            return [of_actions.t()[self.actions.flatten().long()]]
         encoded = encoded_actions(space, self.actions).to(of_actions.dtype)
         if own is None:
             return [F.linear(encoded, of_actions)]

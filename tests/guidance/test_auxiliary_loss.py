@@ -166,6 +166,8 @@ def test_auxiliary_loss_ends_with_guidance_unless_it_has_its_own_schedule(monkey
 class Permits:
     """A predictor that permits the given actions where x > 0, and every action elsewhere."""
 
+    has_outputs_of_actions = False
+
     def __init__(self, *actions):
         self.actions = th.tensor(actions)
 
@@ -173,7 +175,7 @@ class Permits:
         return obs
 
     def logits(self, features, actions):
-        return th.where((features[:, 0] > 0) & ~th.isin(actions, self.actions), -1.0, 1.0)
+        return th.where((features[:, 0] > 0) & ~th.isin(actions.flatten(), self.actions), -1.0, 1.0)
 
 
 def discrete(algorithm, **settings):

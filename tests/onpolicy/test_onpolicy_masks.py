@@ -49,12 +49,12 @@ def test_four_environments_are_judged_in_one_query():
 def test_dict_observations_are_judged_row_by_row():
     env = Line(kind="dict", n_actions=3)
     model = judged_by(  # the rightmost action is rejected in the second half of an episode
-        lambda features, actions: 1.0 - 2.0 * ((features >= 0.45) & (actions[:, 0] == 2)),
+        lambda features, actions: 1.0 - 2.0 * ((features[:, 0] >= 0.45) & (actions[:, 0] == 2)),
         PPOAP,
         env,
         policy="MultiInputPolicy",
     )
-    model.predictor.features = lambda obs: obs["time"][:, 0]
+    model.predictor.features = lambda obs: obs["time"]
     model.learn(32)
     late, early = (
         [int(a) for step, a in enumerate(env.executed) if (step % 10 >= 5) == half] for half in (True, False)

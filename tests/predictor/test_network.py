@@ -10,7 +10,7 @@ from torch import nn
 from sb3_sap import PermissibilityPredictor
 from sb3_sap.common.spaces import joint_actions
 from sb3_sap.predictor.knowledge import LabelledActions
-from sb3_sap.predictor.pairs import ManyActions
+from sb3_sap.predictor.pairs import ManyActions, judge
 
 OBS, ACTIONS = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
 
@@ -203,7 +203,9 @@ def test_dropout_is_active_in_fits_only_and_leaves_the_global_generator_unchange
     assert len(losses) == 2
 
 
-@pytest.mark.parametrize("space", [spaces.Discrete(80), spaces.MultiDiscrete([16, 5]), spaces.MultiBinary(7)])
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(80), spaces.Discrete(9), spaces.MultiDiscrete([16, 5]), spaces.MultiBinary(7)]
+)
 def test_many_actions_are_judged_as_each_of_them_is(space):
     e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), space, net_arch=[8, 8])
     features, actions = th.rand(4, 3), joint_actions(space)
@@ -211,6 +213,17 @@ def test_many_actions_are_judged_as_each_of_them_is(space):
     k = len(actions)
     each = e.logits(features.repeat_interleave(k, dim=0), actions.repeat(4, 1)).reshape(4, k)
     th.testing.assert_close(th.cat(ManyActions(e, actions).logits(features.split(3))), each)
+    th.testing.assert_close(judge(e, features, actions.expand(4, -1, -1)), each)
+    some = actions[th.tensor([[3, 1], [2, 5], [0, 4], [7, 7]])]
+    th.testing.assert_close(judge(e, features, some)[2, 1], each[2, 4])
+
+
+def test_each_of_many_discrete_actions_has_an_output_that_its_labels_alone_teach():
+    e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), spaces.Discrete(100), net_arch=[8])
+    assert [layer.out_features for layer in e.head if isinstance(layer, th.nn.Linear)] == [8, 100]
+    e.loss(th.rand(2, 3), th.tensor([[4], [70]]), th.tensor([1.0, 0.0])).backward()
+    assert e.head[-1].bias.grad.nonzero().flatten().tolist() == [4, 70]
+    assert e.head[-1].bias.grad[[4, 70]].sign().tolist() == [-1, 1]
 
 
 def test_actions_are_judged_anew_after_a_fit():

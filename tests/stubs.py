@@ -12,8 +12,6 @@ from sb3_sap import DDPGAP
 class StubPredictor:
     """A predictor with the given logits, a function of (obs, actions), which records its queries."""
 
-    has_outputs_of_actions = False
-
     def __init__(self, logits_of, fitted=True):
         self.logits_of, self.fitted = logits_of, fitted
         self.queries = []  # number of rows of each

@@ -14,11 +14,12 @@ from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.onpolicy.guide import Guide
 from sb3_sap.onpolicy.masks import MaskedDistribution, index_of, joint_log_probs
 from sb3_sap.onpolicy.states import Remembered, keys_of
-from sb3_sap.predictor.encoding import MANY_ACTIONS
 from sb3_sap.predictor.pairs import ManyActions, judge
 
 #: Maximum number of pairs of a state and an action that E judges at once, which bounds the memory of its layers.
 PAIRS_AT_ONCE = 32_768
+#: Number of actions from which their share of E's first layer is computed once for all states.
+MANY_ACTIONS = 64
 
 
 class EnumeratedGuide(Guide):

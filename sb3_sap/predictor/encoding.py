@@ -12,14 +12,6 @@ from torch.nn import functional as F
 from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.spaces import sizes_of
 
-#: Number of discrete actions from which E has an output for each instead of an input.
-MANY_ACTIONS = 64
-
-
-def has_many_actions(space: spaces.Space[Any]) -> bool:
-    """Whether there are so many discrete actions that a pass of E for each pair of a state and an action is slow."""
-    return isinstance(space, spaces.Discrete) and int(space.n) >= MANY_ACTIONS
-
 
 def encoded_actions(space: spaces.Space[Any], actions: th.Tensor) -> th.Tensor:
     """(n, input_dim) actions as E sees them: one-hot in each discrete dimension, else as they are."""

@@ -24,7 +24,7 @@ from sb3_sap.common.arrays import FloatArray, Observations
 from sb3_sap.common.errors import is_number
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.common.vec_envs import policy_layout
-from sb3_sap.predictor.encoding import encoded_actions, has_many_actions, own_inputs
+from sb3_sap.predictor.encoding import encoded_actions, own_inputs
 from sb3_sap.predictor.knowledge import LabelledActions
 from sb3_sap.predictor.weights import read_predictor, write_predictor
 
@@ -36,8 +36,7 @@ class PermissibilityPredictor(BaseModel):
     """E(s, a | θ_E): the logit that action a is permissible in state s.
 
     Its inputs are observations as the policy gets them, and actions scaled to [-1, 1], or one-hot if they are discrete
-    (in each dimension of a ``MultiDiscrete``); those of a ``MultiBinary`` are as they are. Each of `MANY_ACTIONS`
-    discrete actions or more has an output in place of an input, so that all are judged at once.
+    (in each dimension of a ``MultiDiscrete``); those of a ``MultiBinary`` are as they are.
 
     With ``action_parts`` it has an output for each of k parts of the action, over shared layers. Of a ``Box`` each sees
     the whole action; of a ``MultiDiscrete`` or ``MultiBinary`` its own dimensions alone, the others being zeros, so
@@ -111,12 +110,8 @@ class PermissibilityPredictor(BaseModel):
             "threshold": threshold,
         }
         self.features_extractor = self.make_features_extractor()
-        #: Whether each action has an output of its own.
-        self.has_outputs_of_actions = has_many_actions(action_space) and not self.parts
-        n_inputs, n_outputs = self.features_extractor.features_dim, get_flattened_obs_dim(action_space)
-        if not self.has_outputs_of_actions:
-            n_inputs, n_outputs = n_inputs + n_outputs, len(self.parts) or 1
-        self.head = nn.Sequential(*create_mlp(n_inputs, n_outputs, list(net_arch), activation_fn))
+        n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
+        self.head = nn.Sequential(*create_mlp(n_inputs, len(self.parts) or 1, list(net_arch), activation_fn))
         self._normalises_batches = any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in self.modules())
         # Seeds the random layers, such as dropout, of each fit.
         self._seed = th.initial_seed()
@@ -216,8 +211,6 @@ class PermissibilityPredictor(BaseModel):
 
     def raw_logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """(n, k) logits of the probabilities themselves; without parts (n, 1)."""
-        if self.has_outputs_of_actions:
-            return self.head(features).gather(1, actions.reshape(-1, 1).long())  # type: ignore[no-any-return]
         # A float64 action space brings float64 actions.
         encoded = encoded_actions(self.action_space, actions).to(features.dtype)
         if self.own_inputs is None:

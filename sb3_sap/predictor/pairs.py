@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from torch.nn import functional as F
 
 from sb3_sap.common.arrays import FloatArray
@@ -24,8 +25,6 @@ def judge(
     :param part: the part of the action that is judged; None: the whole
     """
     m, n = actions.shape[:2]
-    if predictor.has_outputs_of_actions:
-        return predictor.head(features).gather(1, actions.reshape(m, n).long()) - predictor.offset  # type: ignore[no-any-return]
     pairs = features.expand(n, -1) if m == 1 else features.repeat_interleave(n, dim=0), actions.reshape(m * n, -1)
     logits = predictor.logits(*pairs) if part is None else predictor.part_logits(*pairs)[:, part]
     return logits.reshape(m, n)
@@ -66,9 +65,6 @@ class ManyActions:
 
         :param batches: (n, features_dim) features
         """
-        if self.predictor.has_outputs_of_actions:
-            chosen = self.actions.flatten().long()
-            return [self.predictor.head(batch)[:, chosen] - self.predictor.offset for batch in batches]
         if self._fitted != int(self.predictor.n_updates):
             self._shares, self._fitted = self._shares_now(), int(self.predictor.n_updates)
         found: Iterable[th.Tensor]
@@ -89,6 +85,8 @@ class ManyActions:
     def _shares_now(self) -> list[th.Tensor]:
         space, own = self.predictor.action_space, self.predictor.own_inputs
         of_actions = self._first.weight[:, -self._first_inputs :]
+        if isinstance(space, spaces.Discrete):
+            return [of_actions.t()[self.actions.flatten().long()]]
         encoded = encoded_actions(space, self.actions).to(of_actions.dtype)
         if own is None:
             return [F.linear(encoded, of_actions)]

@@ -166,8 +166,6 @@ def test_auxiliary_loss_ends_with_guidance_unless_it_has_its_own_schedule(monkey
 class Permits:
     """A predictor that permits the given actions where x > 0, and every action elsewhere."""
 
-    has_outputs_of_actions = False
-
     def __init__(self, *actions):
         self.actions = th.tensor(actions)
 

@@ -218,14 +218,6 @@ def test_many_actions_are_judged_as_each_of_them_is(space):
     th.testing.assert_close(judge(e, features, some)[2, 1], each[2, 4])
 
 
-def test_each_of_many_discrete_actions_has_an_output_that_its_labels_alone_teach():
-    e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), spaces.Discrete(100), net_arch=[8])
-    assert [layer.out_features for layer in e.head if isinstance(layer, th.nn.Linear)] == [8, 100]
-    e.loss(th.rand(2, 3), th.tensor([[4], [70]]), th.tensor([1.0, 0.0])).backward()
-    assert e.head[-1].bias.grad.nonzero().flatten().tolist() == [4, 70]
-    assert e.head[-1].bias.grad[[4, 70]].sign().tolist() == [-1, 1]
-
-
 def test_actions_are_judged_anew_after_a_fit():
     e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), spaces.Discrete(5), net_arch=[8])
     many, features = ManyActions(e, th.arange(5)), th.rand(2, 3)

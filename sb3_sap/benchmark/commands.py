@@ -40,6 +40,7 @@ REPORTS = {
     "robustness": (["robustness"], "summary at 80 km/h and from random starts, for which nothing was tuned"),
     "ways": (["ways"], "ways of using the label: none, as a reward penalty, a loss beside it, and guidance"),
     "failing": (["failing"], "the same for the penalty alone, on many seeds: how many runs fail"),
+    "equal_budget": (["equal_budget"], "the same, with settings that every way has tuned with the same budget"),
     "on_policy": (["on_policy"], "the same for PPO"),
     "starts": (["starts"], "the same for runs that begin with knowledge of elsewhere"),
     "wrong_labels": (["wrong_labels"], "the same for labels that are wrong"),
@@ -47,7 +48,7 @@ REPORTS = {
 #: Reports that are summaries of other configurations.
 SUMMARIES = ("summary", "ablations", "details", "readings", "auxiliary", "robustness")
 #: Reports that compare ways of using the label.
-WAYS = ("ways", "failing", "on_policy", "wrong_labels", "starts")
+WAYS = ("ways", "failing", "equal_budget", "on_policy", "wrong_labels", "starts")
 #: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
 LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_sap.benchmark.configurations import Configuration
+from sb3_sap.benchmark.learners import plain_name
 from sb3_sap.benchmark.reports.drawing import line_figure
 from sb3_sap.benchmark.reports.measures import LOST, median_reached, ms_per_step, steps_to_competence
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_figure, write_page
@@ -26,12 +27,18 @@ SHARES = (0.25, 0.5, 1.0)
 EARLY_SHARES = (0.2, 0.3, 0.5, 0.7, 1.0)
 #: The presets of a penalty alone.
 PENALTY = "base+penalty"
-#: The overrides of the base algorithm.
-NO_PENALTY = (("penalty", "0"),)
+#: The override that makes it the base algorithm.
+NO_PENALTY = ("penalty", "0")
 #: S on every track from which a lap-driving policy has learned the task.
 GOOD = 0.95
+#: What the settings of the configurations have in common.
+SHARED = "All configurations of an algorithm share its base settings."
+EQUAL_BUDGET = (
+    "Each configuration is the best of twelve draws of learning rate, γ, noise and a knob of its own, which "
+    "`measurements/equal_budget.py` made on design seeds and other tracks."
+)
 NOTE = (
-    "All configurations of an algorithm share its base settings. Those with `penalty` or `loss` explore as the base "
+    "{settings} Those with `penalty` or `loss` explore as the base "
     "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of {size} of the "
     "rewards, and `penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as "
     "the interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over "
@@ -61,6 +68,7 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
         write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
+        settings=EQUAL_BUDGET if kind == "equal_budget" else SHARED,
         # The presets of `zoo_configs`: PPO has a smaller penalty, and its loss has none beside it.
         size="a quarter of the root mean square" if kind == "on_policy" else "the root mean square",
         reference=reference,
@@ -78,6 +86,7 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
         "wrong_labels": "Ways of using the label, with wrong labels",
         "starts": "What a run begins with",
         "failing": "How many runs with the penalty fail",
+        "equal_budget": "Ways of using the label, tuned with the same budget",
     }.get(kind, "Ways of using the label")
     title = f"{title} ({results.simulator}, {results.steps:,} steps)"
     write_page(folder / f"{kind}.md", title, parts, results, command)
@@ -94,16 +103,25 @@ def run_scores(results: Results) -> pd.DataFrame:
     return results.laps[always].groupby(keys, sort=False)["score"].mean().reset_index()
 
 
-def peer(ours: Configuration, kind: str) -> Configuration:
-    """What a configuration is compared with: the same algorithm with the penalty that suits all tasks, without a
-    penalty, or with the loss and without a start.
+def peer(ours: Configuration, kind: str, among: list[Configuration]) -> Configuration | None:
+    """What a configuration is compared with: the penalty of the same algorithm, without overrides if there is one; of
+    wrong labels, the algorithm without a penalty; of starts, the loss without a start.
+
+    :param among: the configurations of the page
     """
-    if kind == "wrong_labels":
-        return Configuration(ours.algo, PENALTY, NO_PENALTY)
     if kind == "starts":
         kept = [(key, "nothing" if key == "start" else value) for key, value in ours.overrides if key != "source"]
-        return Configuration(ours.algo, "base+loss", tuple(kept))
-    return Configuration(ours.algo, PENALTY)
+        other = Configuration(ours.algo, "base+loss", tuple(kept))
+        return other if other in among else None
+    without = kind == "wrong_labels"
+    peers = [
+        each
+        for each in among
+        if each.preset == PENALTY
+        and plain_name(each.algo) == plain_name(ours.algo)
+        and (NO_PENALTY in each.overrides) == without
+    ]
+    return min(peers, key=lambda each: len(each.overrides), default=None)
 
 
 def improvement(results: Results, scores: pd.DataFrame, kind: str = "ways") -> pd.DataFrame:
@@ -113,10 +131,10 @@ def improvement(results: Results, scores: pd.DataFrame, kind: str = "ways") -> p
     """
     rows = []
     for ours in results.configurations:
-        other = peer(ours, kind).name
-        if other in results.names and other != ours.name:
-            estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, other, 1.0))
-            rows.append([ours.name, other, *estimate])
+        other = peer(ours, kind, results.configurations)
+        if other is not None and other != ours:
+            estimate = probability_of_improvement(_at(scores, ours.name, 1.0), _at(scores, other.name, 1.0))
+            rows.append([ours.name, other.name, *estimate])
     return pd.DataFrame(rows, columns=["configuration", "against", "probability", "low", "high"])
 
 

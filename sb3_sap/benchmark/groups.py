@@ -98,6 +98,14 @@ GROUPS: dict[str, list[str]] = {
             "fast",
         )
     ],
+    # The same for DDPG, with the winners of `measurements/equal_budget.py`.
+    "equal_budget": [
+        "ddpg_ap:base+penalty[penalty=0,learning_rate=0.001,gamma=0.95,action_noise=null]",
+        "ddpg_ap:base+penalty[penalty=0,potential=sb3_sap.benchmark.potentials.centre_100]",
+        "ddpg_ap:base+penalty[learning_rate=0.002,gamma=0.95,action_noise=null,penalty=auto]",
+        "ddpg_ap:base+loss[learning_rate=0.002,gamma=0.99,action_noise=null,permissibility_coef=lin_3.0_0.5]",
+        "ddpg_ap:fast[learning_rate=0.001,gamma=0.95,action_noise=null,actor_permissibility_coef=3,alpha=0.9]",
+    ],
     # The recommended use of the label, on more seeds: how many runs fail?
     "failing": [f"{algo}:base+penalty" for algo in ("ddpg_ap", "td3_ap", "sac_ap", "tqc_ap")],
     # The same for PPO.

@@ -16,6 +16,9 @@ from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 #: A way is taken for better only if the lower end of the interval of its probability of improvement is above this.
 SHOWN = 0.5
+#: Number of runs of each way below which a rank test cannot tell even the clearest difference from chance: of two times
+#: three runs, one order in twenty puts all of one way first.
+FEW = 4
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,11 @@ class Comparison:
                 f"{best.name.capitalize()} did best, but is not shown to be better than {choice.name}, which is "
                 f"simpler: probability {p:.2f} ({low:.2f} to {high:.2f}). More seeds would tell."
             )
-        steps = int(self.evaluations["step"].max())
-        return " ".join([*sentences, f"This holds for {steps:,} steps."])
+        steps, runs = int(self.evaluations["step"].max()), len(self.scores(choice.name))
+        sentences.append(f"This holds for {steps:,} steps.")
+        if runs < FEW:
+            sentences.append(f"With {runs} runs of each way it may be chance: repeat it with `seeds` of {FEW} or more.")
+        return " ".join(sentences)
 
     @property
     def code(self) -> str:

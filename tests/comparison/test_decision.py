@@ -40,6 +40,12 @@ def test_way_that_is_clearly_better_is_chosen():
     assert result.code == "# penalty"
 
 
+@pytest.mark.parametrize(("number", "warned"), [(2, True), (3, True), (4, False)])
+def test_decision_of_few_runs_says_that_it_may_be_chance(number, warned):
+    decision = compared({"base": runs(0, 1)[:number], "penalty": runs(5, 6)[:number]}).decision
+    assert (f"With {number} runs of each way it may be chance" in decision) == warned
+
+
 def test_simplest_way_is_chosen_where_no_other_is_shown_to_be_better():
     result = compared({"base": runs(0, 1, noise=1.0), "penalty": runs(0.5, 1.5, noise=1.0)})
     assert result.best.name == "penalty"

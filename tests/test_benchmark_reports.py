@@ -11,6 +11,7 @@ from sb3_sap.benchmark.configurations import parse_configurations
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
 from sb3_sap.benchmark.reports.claims import CLAIMS, claims, judged
+from sb3_sap.benchmark.reports.drawing import line_figure
 from sb3_sap.benchmark.reports.drawing import curve_figure
 from sb3_sap.benchmark.reports.figures import with_averages
 from sb3_sap.benchmark.reports.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
@@ -304,6 +305,15 @@ def test_pages_of_another_reading_have_names_of_their_own(tmp_path):
     page = (tmp_path / "highway-3000" / "figure4_adam.md").read_text()
     assert "(figure4a_adam.svg)" in page
     assert "(figure4b_adam.svg)" in page
+
+
+def test_equal_settings_of_several_algorithms_have_the_same_colour():
+    names = ["a:base", "a:penalty", "a:loss", "b:penalty", "b:loss", *(f"c:{number}" for number in range(4))]
+    table = pd.DataFrame([[name, seed, x, 1.0] for name in names for seed in (0, 1) for x in (0, 1)])
+    figure = line_figure(table.set_axis(["configuration", "seed", "x", "y"], axis=1), names, "x", "y", "x", "y")
+    colours = {line.get_label(): line.get_color() for axes in figure.axes for line in axes.get_lines()}
+    assert len(figure.axes) == 3
+    assert colours["a:penalty"] == colours["b:penalty"] != colours["a:loss"] == colours["b:loss"]
 
 
 def test_ways_of_using_the_label(tmp_path):

@@ -26,24 +26,26 @@ TOGETHER = 8
 def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: str, y_label: str) -> Figure:
     """A line for every configuration: the interquartile mean of ``y`` over its runs, and its bootstrap interval.
 
-    More than `TOGETHER` have a panel for each algorithm.
+    More than `TOGETHER` have a panel for each algorithm, in all of which equal settings have the same colour.
     """
-    panels_of = [names]
+    panels_of, colours = [names], {name: number for number, name in enumerate(names)}
     if len(names) > TOGETHER:
         panels_of = [list(group) for _, group in itertools.groupby(names, lambda name: name.partition(":")[0])]
+        settings = list(dict.fromkeys(name.partition(":")[2] for name in names))
+        colours = {name: settings.index(name.partition(":")[2]) for name in names}
     figure = Figure(figsize=(WIDTH, 1.5 + 3 * len(panels_of)), layout="constrained")
     panels = figure.subplots(len(panels_of), squeeze=False, sharex=True, sharey=True)[:, 0]
     for axes, group in zip(panels, panels_of, strict=True):
         axes.set_ylabel(y_label)
         axes.grid(alpha=0.3)
-        for number, name in enumerate(group):
+        for name in group:
             wide = table[table["configuration"] == name].pivot(index=x, columns="seed", values=y).dropna(how="all")
             means, bands = [], []
             for values in wide.to_numpy():
                 known = values[~np.isnan(values)]
                 means.append(stats.trim_mean(known, 0.25))
                 bands.append(bootstrap_interval(known[:, None], resamples=500))
-            _line(axes, number, name, wide.index, means, *np.transpose(bands))
+            _line(axes, colours[name], name, wide.index, means, *np.transpose(bands))
         if len(panels_of) > 1:
             axes.legend(loc="lower right", fontsize="small")
     panels[-1].set_xlabel(x_label)

@@ -11,8 +11,7 @@ from sb3_sap.benchmark.configurations import parse_configurations
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
 from sb3_sap.benchmark.reports.claims import CLAIMS, claims, judged
-from sb3_sap.benchmark.reports.drawing import line_figure
-from sb3_sap.benchmark.reports.drawing import curve_figure
+from sb3_sap.benchmark.reports.drawing import curve_figure, line_figure
 from sb3_sap.benchmark.reports.figures import with_averages
 from sb3_sap.benchmark.reports.measures import median_reached, per_run, seconds_to_competence, steps_to_competence
 from sb3_sap.benchmark.reports.results import collect

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Real
@@ -18,6 +19,7 @@ from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.guidance.algorithm1 import GuidedExplorationMixin
 from sb3_sap.guidance.auxiliary_loss import permissible_actor_step, permissible_value_step
 from sb3_sap.guidance.teaching import cloning_step, taught_step
+from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
 from sb3_sap.predictor.schedule import check_growth, due
 
 #: After guidance ends, refit the predictor only every n-th time.
@@ -136,6 +138,13 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
             raise ValueError("`imitate` needs continuous actions: leave it out.")
         if imitate is None:
             imitate = not self.discrete and self.knows_permissible
+        if not imitate and self.predictor.fitted and not self.predictor_accurate:
+            warnings.warn(
+                f"The AP predictor teaches the policy, but its balanced accuracy is {self.validation_accuracy:.0%}, below "
+                f"the {SUFFICIENT_ACCURACY:.0%} from which its verdicts are trusted: give it more labelled actions and call "
+                "`fit_predictor` first.",
+                stacklevel=2,
+            )
         losses, n = [], self.predictor.batch_size
         lessons: Any = self.known_actions(n) if imitate else self.known_states(n)
         for lesson in itertools.islice(lessons, steps):

@@ -442,6 +442,17 @@ def test_policy_cannot_be_taught_by_nothing():
         build(DQNAP).teach_policy(imitate=True)
 
 
+def test_predictor_that_is_right_too_seldom_teaches_with_a_warning(recwarn):
+    model, _ = known()
+    model.fit_predictor()
+    model.teach_policy(1, imitate=False)
+    assert not [w for w in recwarn if "balanced accuracy" in str(w.message)]
+    model.validation_accuracy = 0.55
+    model.teach_policy(1)  # which imitates
+    with pytest.warns(UserWarning, match="its balanced accuracy is 55%, below the 70% from which"):
+        model.teach_policy(1, imitate=False)
+
+
 def test_frozen_predictor_stays_as_it_is():
     model, _ = known(freeze_predictor=True)
     model.fit_predictor(epochs=6)

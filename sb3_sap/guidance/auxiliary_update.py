@@ -140,9 +140,9 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
             imitate = not self.discrete and self.knows_permissible
         if not imitate and self.predictor.fitted and not self.predictor_accurate:
             warnings.warn(
-                f"The AP predictor teaches the policy, but its balanced accuracy is {self.validation_accuracy:.0%}, below "
-                f"the {SUFFICIENT_ACCURACY:.0%} from which its verdicts are trusted: give it more labelled actions and call "
-                "`fit_predictor` first.",
+                f"The AP predictor teaches the policy, but its balanced accuracy is {self.validation_accuracy:.0%}, "
+                f"below the {SUFFICIENT_ACCURACY:.0%} from which its verdicts are trusted: give it more labelled "
+                "actions and call `fit_predictor` first.",
                 stacklevel=2,
             )
         losses, n = [], self.predictor.batch_size

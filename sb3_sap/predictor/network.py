@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,9 +20,9 @@ from torch.nn import functional as F
 
 from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import FloatArray, Observations
-from sb3_sap.common.errors import is_number
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.common.vec_envs import policy_layout
+from sb3_sap.predictor.arguments import check_arguments, optimizer_named
 from sb3_sap.predictor.encoding import encoded_actions, own_inputs
 from sb3_sap.predictor.knowledge import LabelledActions
 from sb3_sap.predictor.weights import read_predictor, write_predictor
@@ -79,14 +78,8 @@ class PermissibilityPredictor(BaseModel):
         action_parts: Mapping[str, Sequence[int]] | None = None,
         threshold: float = 0.5,
     ):
-        if isinstance(optimizer_class, str):
-            found = getattr(th.optim, optimizer_class, None)
-            if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
-                raise ValueError(
-                    f"`optimizer_class` = {optimizer_class!r} names no optimizer of torch.optim, such as 'Adam'."
-                )
-            optimizer_class = found
-        _check_arguments(net_arch, batch_size, learning_rate, threshold)
+        optimizer_class = optimizer_named(optimizer_class)
+        check_arguments(net_arch, batch_size, learning_rate, threshold)
         super().__init__(
             observation_space,
             action_space,
@@ -325,14 +318,3 @@ class PermissibilityPredictor(BaseModel):
         obs: Any = obs_as_tensor(dataset.observations, self.device)
         actions, labels = (th.as_tensor(array, device=self.device) for array in dataset[1:])
         return obs, actions, labels
-
-
-def _check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any, threshold: Any) -> None:
-    if not (is_number(threshold) and 0 < threshold < 1):
-        raise ValueError(f"`threshold` of the predictor must lie between 0 and 1, but is {threshold!r}.")
-    if not isinstance(net_arch, (list, tuple)) or not all(isinstance(n, Integral) and int(n) > 0 for n in net_arch):
-        raise ValueError(f"`net_arch` must be a list of the widths of hidden layers, but is {net_arch!r}.")
-    if not (isinstance(batch_size, Integral) and int(batch_size) > 0):
-        raise ValueError(f"`batch_size` must be a whole number of at least 1, but is {batch_size!r}.")
-    if not (isinstance(learning_rate, Real) and float(learning_rate) >= 0):
-        raise ValueError(f"`learning_rate` of the predictor must be a number of at least 0, but is {learning_rate!r}.")

@@ -307,12 +307,13 @@ def test_pages_of_another_reading_have_names_of_their_own(tmp_path):
 
 
 def test_equal_settings_of_several_algorithms_have_the_same_colour():
-    names = ["a:base", "a:penalty", "a:loss", "b:penalty", "b:loss", *(f"c:{number}" for number in range(4))]
+    names = ["a:base", "a:loss[x=1]", "a:loss[x=2]", "b:loss[x=1,y=0]", "b:loss[x=2,y=0]"]  # all of b have y = 0
+    names += [f"c:{number}" for number in range(4)]
     table = pd.DataFrame([[name, seed, x, 1.0] for name in names for seed in (0, 1) for x in (0, 1)])
     figure = line_figure(table.set_axis(["configuration", "seed", "x", "y"], axis=1), names, "x", "y", "x", "y")
     colours = {line.get_label(): line.get_color() for axes in figure.axes for line in axes.get_lines()}
     assert len(figure.axes) == 3
-    assert colours["a:penalty"] == colours["b:penalty"] != colours["a:loss"] == colours["b:loss"]
+    assert colours["a:loss[x=1]"] == colours["b:loss[x=1,y=0]"] != colours["a:loss[x=2]"] == colours["b:loss[x=2,y=0]"]
 
 
 def test_ways_of_using_the_label(tmp_path):

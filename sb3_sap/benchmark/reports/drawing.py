@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 from scipy import stats
 
-from sb3_sap.benchmark.configurations import Configuration
+from sb3_sap.benchmark.configurations import Configuration, parse_configuration
 from sb3_sap.evaluation.statistics import bootstrap_interval
 
 #: Width of a figure in inches.
@@ -31,8 +31,8 @@ def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: 
     panels_of, colours = [names], {name: number for number, name in enumerate(names)}
     if len(names) > TOGETHER:
         panels_of = [list(group) for _, group in itertools.groupby(names, lambda name: name.partition(":")[0])]
-        settings = list(dict.fromkeys(name.partition(":")[2] for name in names))
-        colours = {name: settings.index(name.partition(":")[2]) for name in names}
+        settings = {name: found for group in panels_of for name, found in zip(group, _differing(group), strict=True)}
+        colours = {name: list(dict.fromkeys(settings.values())).index(found) for name, found in settings.items()}
     figure = Figure(figsize=(WIDTH, 1.5 + 3 * len(panels_of)), layout="constrained")
     panels = figure.subplots(len(panels_of), squeeze=False, sharex=True, sharey=True)[:, 0]
     for axes, group in zip(panels, panels_of, strict=True):
@@ -54,6 +54,13 @@ def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: 
         beside = LEGEND_WIDTH // (6 + max(map(len, labels)))  # line and gap of an entry are as wide as six letters
         figure.legend(loc="outside lower center", ncols=min(len(labels), max(1, beside)))
     return figure
+
+
+def _differing(names: list[str]) -> list[tuple[str, frozenset[Any]]]:
+    """The preset of each configuration, and those of its overrides that not all of them have."""
+    parsed = [parse_configuration(name) for name in names]
+    common = frozenset.intersection(*(frozenset(each.overrides) for each in parsed))
+    return [(each.preset, frozenset(each.overrides) - common) for each in parsed]
 
 
 def episodes_figure(episodes: pd.DataFrame, names: list[str]) -> Figure:

@@ -313,7 +313,19 @@ def test_equal_settings_of_several_algorithms_have_the_same_colour():
     figure = line_figure(table.set_axis(["configuration", "seed", "x", "y"], axis=1), names, "x", "y", "x", "y")
     colours = {line.get_label(): line.get_color() for axes in figure.axes for line in axes.get_lines()}
     assert len(figure.axes) == 3
-    assert colours["a:loss[x=1]"] == colours["b:loss[x=1,y=0]"] != colours["a:loss[x=2]"] == colours["b:loss[x=2,y=0]"]
+    assert colours["a:loss[x=1]"] == colours["b:loss[x=1]"] != colours["a:loss[x=2]"] == colours["b:loss[x=2]"]
+
+
+def test_legend_has_what_differs_without_modules(tmp_path):
+    names = [
+        "a:base[f=some.module.f,c=0.5]",
+        "a:base[f=some.module.f,p=some.other.Potential]",
+        "a:base[f=some.module.f]",
+    ]
+    table = pd.DataFrame([[name, seed, x, 1.0] for name in names for seed in (0, 1) for x in (0, 1)])
+    figure = line_figure(table.set_axis(["configuration", "seed", "x", "y"], axis=1), names, "x", "y", "x", "y")
+    labels = [line.get_label() for line in figure.axes[0].get_lines()]
+    assert labels == ["a:base[c=0.5]", "a:base[p=Potential]", "a:base"]
 
 
 def test_ways_of_using_the_label(tmp_path):

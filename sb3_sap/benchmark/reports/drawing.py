@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from sb3_sap.evaluation.statistics import bootstrap_interval
 WIDTH = 9
 #: Letters of a legend that fit side by side below a figure.
 LEGEND_WIDTH = 110
+#: The module of a dotted name.
+_MODULE = re.compile(r"\b[a-z]\w*\.(\w+\.)*(?=[A-Za-z_])")
 #: Maximum number of lines in one panel where configurations are of several algorithms.
 TOGETHER = 8
 
@@ -31,21 +34,21 @@ def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: 
     panels_of, colours = [names], {name: number for number, name in enumerate(names)}
     if len(names) > TOGETHER:
         panels_of = [list(group) for _, group in itertools.groupby(names, lambda name: name.partition(":")[0])]
-        settings = {name: found for group in panels_of for name, found in zip(group, _differing(group), strict=True)}
-        colours = {name: list(dict.fromkeys(settings.values())).index(found) for name, found in settings.items()}
+        settings = {name: replace(own, algo="") for group in panels_of for name, own in _distinct(group).items()}
+        colours = {name: list(dict.fromkeys(settings.values())).index(own) for name, own in settings.items()}
     figure = Figure(figsize=(WIDTH, 1.5 + 3 * len(panels_of)), layout="constrained")
     panels = figure.subplots(len(panels_of), squeeze=False, sharex=True, sharey=True)[:, 0]
     for axes, group in zip(panels, panels_of, strict=True):
         axes.set_ylabel(y_label)
         axes.grid(alpha=0.3)
-        for name in group:
+        for name, own in _distinct(group).items():
             wide = table[table["configuration"] == name].pivot(index=x, columns="seed", values=y).dropna(how="all")
             means, bands = [], []
             for values in wide.to_numpy():
                 known = values[~np.isnan(values)]
                 means.append(stats.trim_mean(known, 0.25))
                 bands.append(bootstrap_interval(known[:, None], resamples=500))
-            _line(axes, colours[name], name, wide.index, means, *np.transpose(bands))
+            _line(axes, colours[name], _MODULE.sub("", own.name), wide.index, means, *np.transpose(bands))
         if len(panels_of) > 1:
             axes.legend(loc="lower right", fontsize="small")
     panels[-1].set_xlabel(x_label)
@@ -56,11 +59,12 @@ def line_figure(table: pd.DataFrame, names: list[str], x: str, y: str, x_label: 
     return figure
 
 
-def _differing(names: list[str]) -> list[tuple[str, frozenset[Any]]]:
-    """The preset of each configuration, and those of its overrides that not all of them have."""
+def _distinct(names: list[str]) -> dict[str, Configuration]:
+    """The configurations by name, without the overrides that all of them have."""
     parsed = [parse_configuration(name) for name in names]
     common = frozenset.intersection(*(frozenset(each.overrides) for each in parsed))
-    return [(each.preset, frozenset(each.overrides) - common) for each in parsed]
+    kept = [tuple(override for override in each.overrides if override not in common) for each in parsed]
+    return {name: replace(each, overrides=own) for name, each, own in zip(names, parsed, kept, strict=True)}
 
 
 def episodes_figure(episodes: pd.DataFrame, names: list[str]) -> Figure:

@@ -3,7 +3,8 @@
     python measurements/equal_budget.py ddpg_ap torcs --steps 500 --out results/tuning/equal_budget_ddpg.csv
 
 The columns are the base algorithm, shaping by a potential, the penalty, the loss and guidance. Each draws `--draws`
-configurations of learning rate, γ and exploration, with a value of its own knob; the first of them is its preset. They
+configurations of learning rate, γ and exploration (of the length of a rollout, on-policy), with a value of its own knob;
+the first of them is its preset. They
 train with seed 100, and the best `--again` once more with seeds 101 and 102, which decide. A run's value is the mean
 score over all its evaluations, on tracks that are not among the test tracks, so that learning sooner and ending better
 both count. The last line has the winners, as `sb3-sap benchmark ways --configurations` reads them.
@@ -30,10 +31,19 @@ from sb3_sap.evaluation.laps import ENVIRONMENTS
 
 #: Tracks that are not among the test tracks.
 TRACKS = {"torcs": ("g-track-1", "aalborg", "e-track-1"), "highway": ("random:100", "random:101", "random:102")}
-#: The grid that all columns share; algorithms whose policy is stochastic have an entropy instead of noise.
-SHARED: dict[str, list[str]] = {"learning_rate": ["0.0003", "0.001", "0.002"], "gamma": ["0.9", "0.95", "0.99"]}
+#: The grid that all columns share, by algorithm; the learning rate of PPO may fall to 0, as is usual.
+DISCOUNTS = {"gamma": ["0.9", "0.95", "0.99"]}
+RATES = {"learning_rate": ["0.0003", "0.001", "0.002"]}
 NOISE = {"action_noise": ["null", '{"type":"normal","sigma":0.1}', '{"type":"normal","sigma":0.3}']}
 ENTROPY = {"ent_coef": ["auto", "auto_0.1"]}
+ROLLOUTS = {"learning_rate": ["0.0003", "0.001", "lin_0.001", "lin_0.002"], "n_steps": ["128", "256", "512"]}
+SHARED: dict[str, dict[str, list[str]]] = {
+    "ddpg_ap": RATES | DISCOUNTS | NOISE,
+    "td3_ap": RATES | DISCOUNTS | NOISE,
+    "sac_ap": RATES | DISCOUNTS | ENTROPY,
+    "tqc_ap": RATES | DISCOUNTS | ENTROPY,
+    "ppo_ap": ROLLOUTS | DISCOUNTS,
+}
 #: The potentials of each task, of which the second is tried first.
 POTENTIALS = {
     **{simulator: [f"sb3_sap.benchmark.potentials.centre_{size}" for size in (30, 100, 300)] for simulator in TRACKS},
@@ -50,32 +60,37 @@ class Column(NamedTuple):
     knobs: dict[str, list[str]]
 
 
-def columns(simulator: str) -> dict[str, Column]:
+def columns(algo: str, simulator: str) -> dict[str, Column]:
     """The ways that are compared, by name."""
-    guided = "fast" if simulator in ENVIRONMENTS else "task"
     potentials = POTENTIALS[simulator]
-    loss = {"permissibility_coef": ["lin_0.3_0.5", "lin_1.0_0.5", "lin_3.0_0.5"]}
-    guidance = {"actor_permissibility_coef": ["1", "3"], "alpha": ["0.5", "0.9"]}
+    if algo == "ppo_ap":
+        penalty = {"penalty": ["auto_0.1", "auto_0.25", "auto"]}
+        loss = {"permissibility_coef": ["lin_1.0", "lin_3.0", "lin_10.0"]}
+        guidance = Column("base+loss", "alpha=1", "alpha=1,", {"permissibility_coef": ["0", "lin_1.0", "lin_3.0"]})
+    else:
+        penalty = {"penalty": ["auto_0.3", "auto", "auto_3"]}
+        loss = {"permissibility_coef": ["lin_0.3_0.5", "lin_1.0_0.5", "lin_3.0_0.5"]}
+        knobs = {"actor_permissibility_coef": ["1", "3"], "alpha": ["0.5", "0.9"]}
+        guidance = Column("fast" if simulator in ENVIRONMENTS else "task", "", "", knobs)
     return {
         "base": Column("base+penalty", "penalty=0", "penalty=0,", {}),
         "shaping": Column(
             "base+penalty", f"penalty=0,potential={potentials[1]}", "penalty=0,", {"potential": potentials}
         ),
-        "penalty": Column("base+penalty", "", "", {"penalty": ["auto_0.3", "auto", "auto_3"]}),
+        "penalty": Column("base+penalty", "", "", penalty),
         "loss": Column("base+loss", "", "", loss),
-        "guidance": Column(guided, "", "", guidance),
+        "guidance": guidance,
     }
 
 
 def draws(algo: str, column: Column, number: int) -> list[str]:
     """Names of configurations, the preset first; equal ones are drawn once."""
-    shared = SHARED | (NOISE if algo in ("ddpg_ap", "td3_ap") else ENTROPY)
     same, own = random.Random(100), random.Random(200)  # all columns draw the same of what they share
     text = f"[{column.first}]" if column.first else ""
     names: list[str] = []
     while len(names) < number:
         names += [name for name in [parse_configuration(f"{algo}:{column.preset}{text}").name] if name not in names]
-        chosen = {key: same.choice(values) for key, values in shared.items()}
+        chosen = {key: same.choice(values) for key, values in SHARED[algo].items()}
         chosen |= {key: own.choice(values) for key, values in column.knobs.items()}
         text = f"[{column.always}{','.join(f'{key}={value}' for key, value in chosen.items())}]"
     return names
@@ -99,7 +114,7 @@ def values(names: list[str], seeds: list[int], options: argparse.Namespace) -> d
 def main() -> None:
     """Writes a row for each draw and prints the winners."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("algo", help="a guided algorithm with continuous actions")
+    parser.add_argument("algo", choices=SHARED, help="a guided algorithm with continuous actions")
     parser.add_argument("simulator", help=f"one of {', '.join(ENVIRONMENTS)}, or the id of a task")
     parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--draws", type=int, default=12)
@@ -108,7 +123,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where single runs are kept")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    drawn = {name: draws(options.algo, column, options.draws) for name, column in columns(options.simulator).items()}
+    drawn = {name: draws(options.algo, column, options.draws) for name, column in columns(options.algo, options.simulator).items()}
     first = values([name for names in drawn.values() for name in names], [100], options)
     best = {column: sorted(names, key=lambda name: -first[name])[: options.again] for column, names in drawn.items()}
     again = values([name for names in best.values() for name in names], [101, 102], options)

@@ -3,11 +3,11 @@
     python measurements/equal_budget.py ddpg_ap torcs --steps 500 --out results/tuning/equal_budget_ddpg.csv
 
 The columns are the base algorithm, shaping by a potential, the penalty, the loss and guidance. Each draws `--draws`
-configurations of learning rate, γ and exploration (of the length of a rollout, on-policy), with a value of its own knob;
-the first of them is its preset. They
-train with seed 100, and the best `--again` once more with seeds 101 and 102, which decide. A run's value is the mean
-score over all its evaluations, on tracks that are not among the test tracks, so that learning sooner and ending better
-both count. The last line has the winners, as `sb3-sap benchmark ways --configurations` reads them.
+configurations of learning rate, γ and exploration (on-policy of the length of a rollout), with a value of its own knob;
+the first of them is its preset. They train with seed 100, and the best `--again` once more with seeds 101 and 102,
+which decide. A run's value is the mean score over all its evaluations, on tracks that are not among the test tracks, so
+that learning sooner and ending better both count. The last line has the winners, as `sb3-sap benchmark ways
+--configurations` reads them.
 """
 
 from __future__ import annotations
@@ -123,7 +123,10 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where single runs are kept")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    drawn = {name: draws(options.algo, column, options.draws) for name, column in columns(options.algo, options.simulator).items()}
+    drawn = {
+        name: draws(options.algo, column, options.draws)
+        for name, column in columns(options.algo, options.simulator).items()
+    }
     first = values([name for names in drawn.values() for name in names], [100], options)
     best = {column: sorted(names, key=lambda name: -first[name])[: options.again] for column, names in drawn.items()}
     again = values([name for names in best.values() for name in names], [101, 102], options)

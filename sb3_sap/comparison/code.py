@@ -63,7 +63,6 @@ def lines(way: Way, job: Job, policy: str, ap_function: Any, potential: Any) -> 
             ")",
             f"model.learn({job.steps:_}, progress_bar=True)",
             'model.save("model")',
-            *(["# It acts with its mask: model.predict(observation, guided=True)"] if way.guided else []),
         ]
     )
 

@@ -130,7 +130,7 @@ def _labelled(job: Job, way: Way, ap_function: Any, potential: Any) -> Job:
         potential = resolve(potential, "potential")
         labels = {"ap_function": does_not_lower(potential), **labels}
         labels |= {"potential": potential} if way.name == "shaping" else {}
-    return replace(job, settings={**labels, **way.settings, **job.settings}, guided=way.guided)
+    return replace(job, settings={**labels, **way.settings, **job.settings})
 
 
 def _train(jobs: list[tuple[Way, Job]], side_by_side: int, console: Console, rows: list[dict[str, Any]]) -> None:

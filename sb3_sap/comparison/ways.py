@@ -25,8 +25,6 @@ class Way:
     meaning: str
     settings: dict[str, Any] = field(default_factory=dict)
     code: str = ""
-    #: Whether it acts with the predictor, ``predict(..., guided=True)``, in evaluations and in use.
-    guided: bool = False
 
 
 def ways(algo: str, potential: bool, finite: bool = False) -> list[Way]:
@@ -57,8 +55,7 @@ def ways(algo: str, potential: bool, finite: bool = False) -> list[Way]:
     if not on_policy:
         found.append(Way("guidance", "Algorithm 1 of the paper", guided, code))
     elif finite:
-        # What the mask forbids is never tried, so that the policy alone may choose it.
-        found.append(Way("mask", "the learned predictor as a mask of the actions", guided, code, guided=True))
+        found.append(Way("mask", "the learned predictor as a mask of the actions", guided, code))
     elif "loss" not in preset_names(algo):
         found.append(Way("guidance", "the first draw that the learned predictor permits", guided, code))
     return found

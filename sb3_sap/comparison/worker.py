@@ -26,7 +26,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_sap.algorithms import GUIDED_ALGORITHMS
 from sb3_sap.benchmark.process import SINGLE_THREADED
 from sb3_sap.evaluation.environments import make_env
-from sb3_sap.guidance.action_filter import GuidedPolicy
 from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
 #: Seed of the evaluation episodes, the same in every run.
@@ -40,7 +39,6 @@ class Job:
 
     :param env: id of an environment, or a function that makes one
     :param settings: constructor arguments
-    :param guided: whether evaluations are guided by E
     """
 
     env: str | Callable[..., gym.Env[Any, Any]]
@@ -51,7 +49,6 @@ class Job:
     steps: int
     evaluations: int
     episodes: int
-    guided: bool = False
 
     @property
     def rollout(self) -> int:
@@ -83,7 +80,7 @@ class Evaluations(BaseCallback):
 
     def __init__(self, job: Job, report: Callable[[dict[str, Any]], None]):
         super().__init__()
-        self._report, self._episodes, self._guided = report, job.episodes, job.guided
+        self._report, self._episodes = report, job.episodes
         self._due = job.evaluated_at
         self._env = DummyVecEnv([lambda: Monitor(job.make_env())])
 
@@ -102,8 +99,7 @@ class Evaluations(BaseCallback):
     def _evaluate(self, step: int) -> None:
         self._env.seed(EVALUATION_SEED)
         began = time.monotonic()
-        policy: Any = GuidedPolicy(self.model) if self._guided else self.model
-        mean, _ = evaluate_policy(policy, self._env, self._episodes)
+        mean, _ = evaluate_policy(self.model, self._env, self._episodes)
         mistakes, others = self.model.knowledge.seen  # type: ignore[attr-defined]
         row = {"step": step, "return": float(cast(float, mean)), "mistakes": mistakes / max(1, mistakes + others)}
         self._report({**row, "took": time.monotonic() - began})

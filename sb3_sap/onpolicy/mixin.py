@@ -37,7 +37,8 @@ class OnPolicyPermissibilityMixin(GuidedRolloutsMixin):
     - Of continuous actions, the first of some draws from the policy that E permits is executed
       (:class:`~sb3_sap.onpolicy.draws.DrawingGuide`).
 
-    Where E permits nothing everything is permitted. ``predict`` is the policy alone unless ``guided=True`` is passed.
+    Where E permits nothing everything is permitted. ``predict`` applies the masks of finite actions, too, unless
+    ``guided=False`` is passed; of continuous actions it is the policy alone unless ``guided=True`` is passed.
     The parameters are those of :class:`~sb3_sap.onpolicy.settings.OnPolicySettingsMixin`. The chain, from the outside:
     this class learns, ``GuidedRolloutsMixin`` collects, ``OnPolicySettingsMixin`` holds settings and K,
     :class:`~sb3_sap.predictor.transfer.PriorKnowledgeMixin` and what it builds on hold E; then the algorithm.

@@ -21,7 +21,7 @@ from sb3_sap.onpolicy.settings import OnPolicySettingsMixin
 
 
 class GuidedRolloutsMixin(OnPolicySettingsMixin):
-    """Guides the policy while a rollout is collected, and in ``predict`` if it is asked to."""
+    """Guides the policy while a rollout is collected, and in ``predict``."""
 
     _of_this_process: ClassVar[tuple[str, ...]] = (
         *OnPolicySettingsMixin._of_this_process,
@@ -81,14 +81,18 @@ class GuidedRolloutsMixin(OnPolicySettingsMixin):
         state: tuple[np.ndarray[Any, Any], ...] | None = None,
         episode_start: np.ndarray[Any, Any] | None = None,
         deterministic: bool = False,
-        guided: bool = False,
+        guided: bool | None = None,
     ) -> tuple[np.ndarray[Any, Any], tuple[np.ndarray[Any, Any], ...] | None]:
         """SB3's ``predict``.
 
         ``permissible_actions`` hold here, too.
 
-        :param guided: restrict the policy to what E permits, as soon as E was fitted; ``alpha`` is ignored
+        :param guided: restrict the policy to what E permits, as soon as E was fitted; by default where its rollouts
+            are masked, for finite actions with ``alpha=1`` while E is accurate: an action that was masked has no
+            gradient, so that the policy alone might take one that it never tried
         """
+        if guided is None:
+            guided = bool(self.alpha) and self._judges and not isinstance(self.action_space, spaces.Box)
         asks, source = guided and self.predictor.fitted, self._permissible_actions
         if not asks and source is None:
             return super().predict(observation, state, episode_start, deterministic)

@@ -102,7 +102,6 @@ def test_code_of_every_way_of_an_on_policy_algorithm_can_be_run(algo, n_actions,
         policy = policy_for(Line(), algo)
         code = lines(way, job, policy, "toy.towards_centre", "toy.centred").replace(", progress_bar=True", "")
         assert code.count("\n") < 20
-        assert ("guided=True" in code) == (way.name == "mask")
         scope = {}
         exec(code, scope)
         assert scope["model"].num_timesteps == 16
@@ -137,7 +136,7 @@ def test_on_policy_runs_have_whole_rollouts_and_are_evaluated_at_their_ends():
 
 def test_on_policy_run_reports_after_its_updates():
     reports, settings = [], {"n_steps": 8, "batch_size": 4, "ap_function": towards_centre}
-    job = Job(Line, {"n_actions": 3}, "ppo_ap", settings, 0, 24, 10, 1, guided=True).in_rollouts()
+    job = Job(Line, {"n_actions": 3}, "ppo_ap", settings, 0, 24, 10, 1).in_rollouts()
     train(job, reports.append)
     assert [row["step"] for row in reports] == [8, 16, 24]
     assert all(0 <= row["mistakes"] <= 1 for row in reports)

@@ -212,13 +212,26 @@ def test_draws_of_state_dependent_exploration_differ():
 
 
 @pytest.mark.parametrize("algorithm", BASES)
-def test_prediction_is_the_policy_alone_unless_guided(algorithm):
+def test_prediction_has_the_masks_of_the_rollouts(algorithm):
     model = judged_by(lambda obs, actions: actions[:, 0] - 0.5, algorithm, Line(n_actions=2))
     model.policy.action_net.bias.data = th.tensor([5.0, 0.0])
     obs = np.zeros((3, 2), np.float32)
-    alone, guided = (model.predict(obs, deterministic=True, guided=value)[0] for value in (False, True))
-    assert alone.tolist() == [0, 0, 0]
-    assert guided.tolist() == [1, 1, 1]
+
+    def predicted(**options):
+        return model.predict(obs, deterministic=True, **options)[0].tolist()
+
+    alone, masked = [0, 0, 0], [1, 1, 1]
+    assert (predicted(), predicted(guided=True), predicted(guided=False)) == (masked, masked, alone)
+    model.validation_accuracy = 0.6  # rollouts are not masked
+    assert (predicted(), predicted(guided=True)) == (alone, masked)
+    model.validation_accuracy, model.alpha = 1.0, 0
+    assert (predicted(), predicted(guided=True)) == (alone, masked)
+
+
+def test_continuous_prediction_is_the_policy_alone_unless_guided():
+    model = judged_by(above(0.5), PPOAP)
+    model.policy.action_net.bias.data.zero_()
+    assert abs(model.predict(np.zeros(2, np.float32), deterministic=True)[0][0]) < 0.1
 
 
 def test_guided_continuous_prediction_is_the_permissible_action_nearest_to_the_mode():
@@ -231,20 +244,22 @@ def test_guided_continuous_prediction_is_the_permissible_action_nearest_to_the_m
 
 
 class Predicts(BaseCallback):
-    def __init__(self):
+    def __init__(self, guided):
         super().__init__()
-        self.found = []
+        self.guided, self.found = guided, []
 
     def _on_step(self):
-        self.found.append(int(self.model.predict(np.zeros(2, np.float32), deterministic=True)[0]))
+        action, _ = self.model.predict(np.zeros(2, np.float32), deterministic=True, guided=self.guided)
+        self.found.append(int(action))
         return True
 
 
-def test_evaluation_amid_a_rollout_measures_the_policy_alone():
-    env, callback = Recorder(spaces.Discrete(2)), Predicts()
+@pytest.mark.parametrize("guided", [None, False])
+def test_evaluation_amid_a_rollout(guided):
+    env, callback = Recorder(spaces.Discrete(2)), Predicts(guided)
     model = judged_by(lambda obs, actions: actions[:, 0] - 0.5, PPOAP, env, learning_rate=0.0)
     model.policy.action_net.bias.data = th.tensor([5.0, 0.0])
     model.learn(16, callback)
-    assert callback.found == [0] * 16
+    assert callback.found == [0 if guided is False else 1] * 16
     assert [int(action) for _, action in env.executed] == [1] * 16
     assert model.policy.guide is None

@@ -55,7 +55,7 @@ def test_loaded_model_predicts_without_an_environment():
     model.save(file)
     loaded = PPOAP.load(file)
     obs = np.random.default_rng(0).normal(size=(20, 2)).astype(np.float32)
-    for guided in (False, True):
+    for guided in (False, None, True):
         expected = model.predict(obs, deterministic=True, guided=guided)[0]
         np.testing.assert_array_equal(loaded.predict(obs, deterministic=True, guided=guided)[0], expected)
     np.testing.assert_array_equal(GuidedPolicy(loaded).predict(obs, deterministic=True)[0], expected)

@@ -59,11 +59,14 @@ class RewardShaping:
         (:class:`RewardScale`), ``"auto_0.5"``: half as much
     :param potential: Φ, a :class:`Potential`
     :param gamma: γ of the algorithm
+    :param entropy: what an algorithm that maximises entropy weighs it with at first, beside which rewards are large or
+        small (:func:`~sb3_sap.common.entropy.entropy_weight`)
     """
 
     penalty: float | str = 0.0
     potential: Potential | None = None
     gamma: float = 0.99
+    entropy: float = 0.0
 
     def __post_init__(self) -> None:
         named = isinstance(self.penalty, str) and _AUTO.fullmatch(self.penalty)
@@ -88,7 +91,7 @@ class RewardShaping:
         """
         if not isinstance(self.penalty, str):
             return float(self.penalty)
-        return scale * float(self.penalty.removeprefix("auto").removeprefix("_") or 1)
+        return max(scale, self.entropy) * float(self.penalty.removeprefix("auto").removeprefix("_") or 1)
 
     def of_labels(self, labels: BoolArray, scale: float = 1.0) -> FloatArray:
         """(n,) minus c for each mistake among (n,) labels, or among (n, k) labels of k parts of the action."""

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import FloatArray
+from sb3_sap.common.entropy import entropy_weight
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.reward_shaping import Potential, RewardShaping
@@ -44,7 +45,8 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         penalties come with the last of these steps, penalties as long as the transition is still stored
     :param penalty: c, subtracted from the reward of a non-permissible action in the reward that is learned from alone:
         logged returns and evaluations have the reward of the environment. ``"auto"``: the root mean square of the
-        rewards so far, ``"auto_0.5"``: half of it
+        rewards so far, or the entropy coefficient that SAC, TQC or CrossQ begins with, where that is larger;
+        ``"auto_0.5"``: half of it
     :param potential: Φ, a :class:`~sb3_sap.common.reward_shaping.Potential` or its dotted name: γ Φ(s') - Φ(s) is added
         to the reward that is learned from alone, and without an ``ap_function`` or an ``event`` an action is
         permissible if it does not lower Φ
@@ -142,7 +144,8 @@ class LearnedPredictorMixin(WatchedEnvironmentMixin):
         elif holder.pending is None or holder.pending.horizon != self.label_horizon:
             holder.pending = Pending(self.label_horizon)
         holder.ap_function = own if self.ap_function is None else resolve(self.ap_function, "ap_function")
-        holder.shaping = RewardShaping(self.penalty, potential, self.gamma)  # type: ignore[attr-defined]
+        gamma: float = self.gamma  # type: ignore[attr-defined]
+        holder.shaping = RewardShaping(self.penalty, potential, gamma, entropy_weight(self))
         holder.images = self.images
         # With `permissible_actions` a model may do without labels of executed actions, but a penalty needs them.
         holder.needs_labels = holder.shaping.penalises or getattr(self, "permissible_actions", None) is None

@@ -9,7 +9,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import DISCRETE, GUIDED, Line, build, towards_centre
 
-from sb3_sap import DDPGAP, SACAP, ActionPermissibility, check_permissibility, does_not_lower
+from sb3_sap import DDPGAP, PPOAP, SACAP, TQCAP, ActionPermissibility, CrossQAP, check_permissibility, does_not_lower
+from sb3_sap.common.entropy import entropy_weight
 from sb3_sap.common.reward_shaping import RewardScale, RewardShaping
 
 GAMMA = 0.9
@@ -33,6 +34,18 @@ class Ending(Line):
         return obs, reward, abs(self.x) > 0.5, truncated, info
 
 
+class Scaled(Line):
+    """A line whose rewards are small."""
+
+    def __init__(self, size):
+        super().__init__()
+        self.size = size
+
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        return obs, self.size * reward, *rest
+
+
 def positions(buffer, n):
     """x before and after each of the first n transitions, (n * n_envs,) in the order of time."""
     return buffer.observations[:n, :, 0].ravel(), buffer.next_observations[:n, :, 0].ravel()
@@ -50,12 +63,29 @@ def test_replay_buffer_holds_the_reward_less_the_penalty_of_mistakes(algorithm):
 
 @pytest.mark.parametrize(("penalty", "factor"), [("auto", 1.0), ("auto_0.5", 0.5)])
 def test_automatic_penalty_is_the_root_mean_square_of_the_rewards_so_far(penalty, factor):
-    model = build(SACAP, penalty=penalty)
+    model = build(DDPGAP, penalty=penalty)
     model.learn(40)
     before, after = positions(model.replay_buffer, 40)
     scale = np.sqrt(np.cumsum(after**2.0) / np.arange(1, 41))
     expected = -np.abs(after) - factor * scale * (np.abs(after) > np.abs(before))
     assert np.allclose(model.replay_buffer.rewards[:40, 0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("coefficient", "least"), [("auto", 1.0), ("auto_0.1", 0.1), (0.3, 0.3)])
+@pytest.mark.parametrize("algorithm", [SACAP, TQCAP, CrossQAP])
+def test_automatic_penalty_is_not_small_beside_the_entropy(algorithm, coefficient, least):
+    model = build(algorithm, Scaled(1e-3), penalty="auto_2.0", ent_coef=coefficient)
+    model.learn(40)
+    before, after = positions(model.replay_buffer, 40)
+    expected = -1e-3 * np.abs(after) - 2.0 * least * (np.abs(after) > np.abs(before))
+    assert np.allclose(model.replay_buffer.rewards[:40, 0], expected, atol=1e-6)
+
+
+def test_automatic_penalty_where_the_entropy_has_other_units():
+    model = build(SACAP, VecNormalize(DummyVecEnv([lambda: Scaled(1e-3)])), penalty="auto")
+    model.learn(40)
+    assert -2e-3 < model.replay_buffer.rewards[:40].min() < 0
+    assert entropy_weight(PPOAP("MlpPolicy", Line(), ap_function=towards_centre, ent_coef=0.01)) == 0
 
 
 def test_automatic_penalty_is_one_while_all_rewards_are_zero():

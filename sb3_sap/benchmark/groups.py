@@ -108,10 +108,14 @@ GROUPS: dict[str, list[str]] = {
     ],
     # The recommended use of the label, on more seeds: how many runs fail?
     "failing": [f"{algo}:base+penalty" for algo in ("ddpg_ap", "td3_ap", "sac_ap", "tqc_ap")],
-    # The same for PPO.
+    # The same for PPO, with the winners of the search; the presets of the penalty and the loss are among its draws.
     "on_policy": [
-        f"ppo_ap:{presets}"
-        for presets in ("base+penalty[penalty=0]", "base+penalty[penalty=50]", "base+penalty", "base+loss")
+        "ppo_ap:base+penalty[penalty=0]",
+        "ppo_ap:base+penalty[penalty=0,potential=sb3_sap.benchmark.potentials.centre_100]",
+        "ppo_ap:base+penalty",
+        "ppo_ap:base+penalty[learning_rate=0.001,n_steps=512,gamma=0.95,penalty=auto_0.1]",
+        "ppo_ap:base+loss",
+        "ppo_ap:base+loss[alpha=1]",
     ],
     # What a run begins with, from an agent on the embedded simulator and from logs. A policy that knows something
     # already needs less entropy.

@@ -20,6 +20,7 @@ from sb3_sap.benchmark.task_settings import target_return
 from sb3_sap.common.arrays import FloatArray
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 
 #: Shares of the training after which the score is told.
 SHARES = (0.25, 0.5, 1.0)
@@ -33,14 +34,21 @@ NO_PENALTY = ("penalty", "0")
 GOOD = 0.95
 #: What the settings of the configurations have in common.
 SHARED = "All configurations of an algorithm share its base settings."
-EQUAL_BUDGET = (
-    "Each configuration is the best of twelve draws of learning rate, γ, noise and a knob of its own, which "
-    "`measurements/equal_budget.py` made on design seeds and other tracks."
-)
+EQUAL_BUDGET = {
+    "equal_budget": (
+        "Each configuration is the best of twelve draws of learning rate, γ, noise and a knob of its own, which "
+        "`measurements/equal_budget.py` made on design seeds and other tracks."
+    ),
+    "on_policy": (
+        "Each configuration, the penalty without overrides apart, is the best of eight draws of learning rate, γ, "
+        "length of a rollout and a knob of its own, which `measurements/equal_budget.py` made on design seeds and other "
+        "tracks; the presets were among the draws."
+    ),
+}
 NOTE = (
     "{settings} Those with `penalty` or `loss` explore as the base "
     "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of {size} of the "
-    "rewards, and `penalty=0` is the base algorithm. Scores are of the actor alone: the mean over the test {tests}, as "
+    "rewards, and `penalty=0` is the base algorithm. Scores are of {acting}: the mean over the test {tests}, as "
     "the interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over "
     "seeds, in which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. "
     "*Mistakes* is the share of all training steps that the AP function labels non-permissible, and *in excess* what "
@@ -66,11 +74,13 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     improvements = improvement(results, scores, kind)
     if not improvements.empty:
         write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
+    on_policy = all(each.algo in ON_POLICY_ALGORITHMS for each in results.configurations)
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
-        settings=EQUAL_BUDGET if kind == "equal_budget" else SHARED,
+        settings=EQUAL_BUDGET.get(kind, SHARED),
         # The presets of `zoo_configs`: PPO has a smaller penalty, and its loss has none beside it.
-        size="a quarter of the root mean square" if kind == "on_policy" else "the root mean square",
+        size="a quarter of the root mean square" if on_policy else "the root mean square",
+        acting="the actor alone" if laps or not on_policy else "the policy, with its masks where it has learned some",
         reference=reference,
         good="linear feedback" if laps else "the configuration that ends best",
         tests="tracks (without Spring, whose long lap is driven at the end only)" if laps else "episodes",

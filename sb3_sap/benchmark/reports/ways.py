@@ -41,8 +41,8 @@ EQUAL_BUDGET = {
     ),
     "on_policy": (
         "Each configuration, the penalty without overrides apart, is the best of eight draws of learning rate, γ, "
-        "length of a rollout and a knob of its own, which `measurements/equal_budget.py` made on design seeds and other "
-        "tracks; the presets were among the draws."
+        "length of a rollout and a knob of its own, which `measurements/equal_budget.py` made on design seeds and "
+        "other tracks; the presets were among the draws."
     ),
 }
 NOTE = (

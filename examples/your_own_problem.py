@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 
-from sb3_sap import SACAP, RescaleExtractor, check_permissibility
+from sb3_sap import SACAP, RescaleExtractor, check_permissibility, preset
 
 
 def energy_did_not_fall(obs, actions, next_obs):  # (n, 2), (n, 1), (n, 2) -> (n,) bool
@@ -19,9 +19,9 @@ model = SACAP(
     "MlpPolicy",
     env,
     ap_function=energy_did_not_fall,
-    actor_permissibility_coef=1.0,  # adds an auxiliary loss to the actor
     # scales the observations: positions are ones, velocities hundredths
     policy_kwargs={"features_extractor_class": RescaleExtractor},
     seed=1,
+    **preset("penalty", SACAP),  # without it, actions that the predictor rejects are replaced
 )
 model.learn(1_000)

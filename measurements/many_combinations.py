@@ -25,7 +25,7 @@ from sb3_sap import PPOAP, ActionMaskObservation, preset
 from sb3_sap.benchmark.provenance import provenance
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_text
 
-SEEDS, STEPS, EPISODES, DIMENSIONS = range(1120, 1130), 2_048, 20, 8
+SEEDS, STEPS, EPISODES, DIMENSIONS = (100, 101, 102), 2_048, 20, 8
 
 
 class Switches(gym.Env[Any, Any]):

@@ -132,9 +132,12 @@ GROUPS: dict[str, list[str]] = {
             ("penalty", "cloned"),
             ("loss", "imitated"),
             ("loss", "taught"),
+            ("penalty", "replay,source=log"),
             ("penalty", "cloned,source=log"),
-            ("loss", "taught,source=log"),
-            ("loss", "taught,source=random"),
+            ("loss", "imitated,source=log"),
+            ("loss", "imitated,source=wrong"),
+            ("loss", "imitated,source=region"),
+            ("loss", "imitated,source=random"),
         )
     ],
     # The same with labels that are wrong: one in ten, or all in a region.

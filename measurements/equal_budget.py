@@ -118,6 +118,7 @@ def main() -> None:
     parser.add_argument("simulator", help=f"one of {', '.join(ENVIRONMENTS)}, or the id of a task")
     parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--columns", nargs="+", help="ways to tune, such as penalty and loss; by default all")
     parser.add_argument("--again", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="where single runs are kept")
@@ -126,6 +127,7 @@ def main() -> None:
     drawn = {
         name: draws(options.algo, column, options.draws)
         for name, column in columns(options.algo, options.simulator).items()
+        if not options.columns or name in options.columns
     }
     first = values([name for names in drawn.values() for name in names], [100], options)
     best = {column: sorted(names, key=lambda name: -first[name])[: options.again] for column, names in drawn.items()}

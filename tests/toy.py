@@ -128,3 +128,28 @@ def build(algorithm: Any, env: Any = None, **overrides: Any) -> Any:
     if env is None:
         env = Line(n_actions=3) if algorithm in DISCRETE else Line()
     return algorithm(policy, env, **(settings | overrides))
+
+
+#: Settings of K and E with which they are fitted to a few hundred examples.
+SMALL_FITS = {
+    "dataset_size": 128,
+    "predictor_kwargs": {"net_arch": [32], "batch_size": 64, "learning_rate": 0.01},
+    "min_per_class": 2,
+}
+
+
+def line_log(n=2_000, seed=0, kind="array", wrong=False, reward=True):
+    """Independent steps from random places on the line."""
+    rng = np.random.default_rng(seed)
+    x, actions = rng.uniform(-1, 1, (n, 1)).astype(np.float32), rng.uniform(-1, 1, (n, 1)).astype(np.float32)
+    next_x, time = x + 0.1 * actions, np.full((n, 1), 0.5, np.float32)
+
+    def observed(values):
+        return {"x": values, "time": time} if kind == "dict" else np.hstack([values, time])
+
+    log = {"obs": observed(x), "actions": actions, "next_obs": observed(next_x)}
+    if reward:
+        log["rewards"] = -np.abs(next_x[:, 0])
+    if wrong:
+        log["labels"] = (np.abs(next_x) > np.abs(x))[:, 0]
+    return log

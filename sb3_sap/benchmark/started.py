@@ -13,6 +13,7 @@ from sb3_sap.benchmark.cloning import clone
 from sb3_sap.benchmark.linear import GAINS, LinearFeedback
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
+from sb3_sap.guidance.taught_policy import CRITIC_STEPS
 from sb3_sap.presets import preset
 from sb3_sap.transitions.batch import Transitions
 from sb3_sap.transitions.sources import batches_of, joined
@@ -78,7 +79,8 @@ class StartedMixin:
         if self.start == "cloned":
             self.add_knowledge(transitions, into="replay")
             clone(self, joined(list(batches_of(transitions))))
-            self.held_until = HOLD
+            self.held_until, self.released_at = HOLD, 2 * HOLD
+            self._teach_critics(CRITIC_STEPS)
             return
         if self.start in ("replay", "imitated", "taught"):
             self.add_knowledge(transitions, into="replay" if self.start == "replay" else "both")

@@ -20,6 +20,7 @@ class ActionPermissibilityMixin(PermissibilityLossMixin):
 
         ActionPermissibilityMixin    predict(guided=True)
         PermissibilityLossMixin      a loss on E within the updates of the actor or the Q-values
+        TaughtPolicyMixin            a policy that is taught before the first step
         AuxiliaryLossMixin           the same with updates of its own
         GuidedExplorationMixin       Algorithm 1
         LearnedPermissibilityMixin   labels, knowledge buffer K, AP predictor E

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from sb3_sap.common.settings import SettingsMixin
 from sb3_sap.common.torch_utils import flush_denormals
 from sb3_sap.guidance.auxiliary_loss import mean_action, preference_loss, rejection
-from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
+from sb3_sap.guidance.taught_policy import TaughtPolicyMixin
 from sb3_sap.guidance.values import q_values
 
 #: The spread of Q is measured where the number of updates is a multiple of this.
@@ -25,7 +25,7 @@ MEASURED_ACTIONS = 8
 MEMORY = 0.9
 
 
-class PermissibilityLossMixin(AuxiliaryLossMixin):
+class PermissibilityLossMixin(TaughtPolicyMixin):
     """Adds the gradient of a loss on E to each update of the actor, or for discrete actions of the Q-values.
 
     The actor climbs Q(s, μ(s)) − β σ_Q softplus(−E(s, μ(s))): beside the long-term value, which the critics learn by

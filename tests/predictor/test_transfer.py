@@ -12,38 +12,15 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
-from toy import DISCRETE, GUIDED, Line, build, towards_centre
+from toy import DISCRETE, GUIDED, SMALL_FITS, Line, build, line_log, towards_centre
 
 from sb3_sap import A2CAP, DDPGAP, DQNAP, PPOAP, SACAP, LearnedPermissibility, PermissibilityPredictor
 from sb3_sap.guidance.teaching import SPREAD
 from sb3_sap.transitions.sources import batches_of, joined
 
-WIDE = {
-    "dataset_size": 128,
-    "predictor_kwargs": {"net_arch": [32], "batch_size": 64, "learning_rate": 0.01},
-    "min_per_class": 2,
-}
-
-
-def line_log(n=2_000, seed=0, kind="array", wrong=False, reward=True):
-    """Independent steps from random places on the line."""
-    rng = np.random.default_rng(seed)
-    x, actions = rng.uniform(-1, 1, (n, 1)).astype(np.float32), rng.uniform(-1, 1, (n, 1)).astype(np.float32)
-    next_x, time = x + 0.1 * actions, np.full((n, 1), 0.5, np.float32)
-
-    def observed(values):
-        return {"x": values, "time": time} if kind == "dict" else np.hstack([values, time])
-
-    log = {"obs": observed(x), "actions": actions, "next_obs": observed(next_x)}
-    if reward:
-        log["rewards"] = -np.abs(next_x[:, 0])
-    if wrong:
-        log["labels"] = (np.abs(next_x) > np.abs(x))[:, 0]
-    return log
-
 
 def known(algorithm=DDPGAP, env=None, log=None, **settings):
-    model = build(algorithm, env, ap_function=towards_centre, **(WIDE | settings))
+    model = build(algorithm, env, ap_function=towards_centre, **(SMALL_FITS | settings))
     report = model.add_knowledge(line_log() if log is None else log, into="knowledge")
     return model, report
 
@@ -79,9 +56,9 @@ def test_what_is_kept_is_a_random_sample_of_all():
 def test_every_algorithm_takes_a_log(algorithm):
     settings = {"n_steps": 16, "batch_size": 16} if algorithm is PPOAP else {}
     if algorithm in (PPOAP, A2CAP):
-        model = algorithm("MlpPolicy", Line(), ap_function=towards_centre, seed=0, **settings, **WIDE)
+        model = algorithm("MlpPolicy", Line(), ap_function=towards_centre, seed=0, **settings, **SMALL_FITS)
     else:
-        model = build(algorithm, ap_function=towards_centre, **WIDE)
+        model = build(algorithm, ap_function=towards_centre, **SMALL_FITS)
     report = model.add_knowledge(line_log())
     assert report.kept_examples == 2_000
     assert report.into_replay == (0 if algorithm in (PPOAP, A2CAP) else 2_000)

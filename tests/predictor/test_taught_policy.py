@@ -1,0 +1,96 @@
+"""A taught policy: the critics learn about it first, and it is released gradually."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch as th
+from toy import SMALL_FITS, build, line_log, towards_centre
+
+from sb3_sap import DDPGAP, DQNAP, SACAP
+from sb3_sap.guidance import taught_policy
+
+
+def known(algorithm=DDPGAP, into="both", **settings):
+    model = build(algorithm, ap_function=towards_centre, **(SMALL_FITS | {"t_k": 0, "learning_starts": 0} | settings))
+    model.add_knowledge(line_log(), into=into)
+    return model
+
+
+def states(*modules):
+    return [copy.deepcopy(module.state_dict()) for module in modules]
+
+
+def equal(one, other):
+    return all(th.equal(value, other[name]) for name, value in one.items())
+
+
+@pytest.mark.parametrize("algorithm", [DDPGAP, SACAP])
+def test_critics_learn_from_the_log_what_a_held_policy_is_worth(algorithm):
+    model = known(algorithm)
+    model.teach_policy(20, hold=30, critic_steps=0)
+    actor, critic = states(model.actor, model.critic)
+    entropy = model.log_ent_coef.item() if algorithm is SACAP else None
+    model.teach_policy(1, hold=30, critic_steps=50)
+    assert model._n_updates == 50
+    assert not equal(critic, model.critic.state_dict())
+    if algorithm is SACAP:
+        assert model.log_ent_coef.item() == entropy
+    assert not hasattr(model, "_logger")  # so that `learn` opens the user's
+    moved = max(
+        (a - b).abs().max().item() for a, b in zip(actor.values(), model.actor.state_dict().values(), strict=True)
+    )
+    assert moved < 0.01  # by the one step of imitation alone
+
+
+def test_critics_of_a_held_policy_learn_its_values():
+    """The reward is minus the distance from the centre, and nothing later counts, so that the values are known."""
+    model = known(gamma=0.0, learning_rate=0.01, policy_kwargs={"net_arch": [64, 64]})
+    model.teach_policy(100, hold=10, critic_steps=400)
+    obs = np.array([[0.8, 0.5], [0.4, 0.5], [0.1, 0.5]], dtype=np.float32)
+    actions = np.zeros((3, 1), dtype=np.float32)
+    with th.no_grad():
+        values = model.critic(th.as_tensor(obs), th.as_tensor(actions))[0][:, 0].numpy()
+    np.testing.assert_allclose(values, -obs[:, 0], atol=0.06)
+
+
+def test_policy_is_released_gradually():
+    """Right after the hold it moves less than a policy that was not held, in as many steps."""
+    moved = []
+    for hold in (20, 0):
+        model = known()
+        model.teach_policy(50, hold=hold, critic_steps=0)
+        if hold:
+            model.learn(hold)
+        (before,) = states(model.actor)
+        model.learn(4, reset_num_timesteps=False)
+        after = model.actor.state_dict()
+        moved.append(sum((after[name] - value).abs().sum().item() for name, value in before.items()))
+    assert 0 < moved[0] < 0.35 * moved[1]
+    model = known()
+    model.teach_policy(50, hold=20, critic_steps=0)
+    assert (model.held_until, model.released_at) == (20, 40)
+
+
+def test_released_policy_continues_in_a_loaded_model(tmp_path):
+    model = known()
+    model.teach_policy(50, hold=20, critic_steps=0)
+    model.learn(10)
+    model.save(tmp_path / "model")
+    loaded = DDPGAP.load(tmp_path / "model")
+    assert (loaded.held_until, loaded.released_at) == (20, 40)
+
+
+def test_critics_are_not_taught_where_nothing_is_known_to_them(monkeypatch):
+    model = known(into="knowledge")
+    model.teach_policy(5, hold=10)
+    assert model._n_updates == 0
+    monkeypatch.setattr(taught_policy, "CRITIC_STEPS", 3)
+    both = known()
+    both.teach_policy(5, hold=10)
+    assert both._n_updates == 3
+    for bad in ({"hold": 10, "critic_steps": 5}, {"hold": 0, "critic_steps": 5}, {"hold": 10, "critic_steps": -1}):
+        with pytest.raises(ValueError, match="needs continuous actions, a `hold` above 0 and transitions with rewards"):
+            model.teach_policy(5, **bad)
+    with pytest.raises(ValueError, match="needs continuous actions"):
+        build(DQNAP).teach_policy(5, hold=10, critic_steps=5)

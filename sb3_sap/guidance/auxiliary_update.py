@@ -64,7 +64,7 @@ class AuxiliaryLossMixin(GuidedExplorationMixin):
             return due(self.refit_growth, before, now, max_gap=STEPS_BETWEEN_FITS)
         return due(self.refit_growth, before, now, every=FITS_AFTER_GUIDANCE if self.predictor_idle else 1)
 
-    def train(self, gradient_steps: int, batch_size: int) -> None:
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         before = self._n_updates
         super().train(gradient_steps, batch_size)
         coef = FloatSchedule(self.actor_permissibility_coef)(self._current_progress_remaining)

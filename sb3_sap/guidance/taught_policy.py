@@ -54,7 +54,8 @@ class TaughtPolicyMixin(AuxiliaryLossMixin):
         """At the end of the block the actor, and what entropy is worth to it, keep a share of their changes."""
         policy: Any = self.policy
         held = [parameter for name in ACTORS if hasattr(policy, name) for parameter in tensors(getattr(policy, name))]
-        held += [self.log_ent_coef] if isinstance(getattr(self, "log_ent_coef", None), th.Tensor) else []
+        coef: Any = getattr(self, "log_ent_coef", None)
+        held += [] if coef is None else [coef]
         before = [tensor.detach().clone() for tensor in held]
         yield
         with th.no_grad():

@@ -45,10 +45,16 @@ EQUAL_BUDGET = {
         "other tracks; the presets were among the draws."
     ),
 }
+#: The penalty of the presets of `zoo_configs`, by whether all configurations are on-policy, and whether none is.
+SIZES = {
+    (True, False): "a quarter of the root mean square of the rewards",
+    (False, True): "the root mean square of the rewards",
+    (False, False): "the root mean square of the rewards, on-policy a quarter of it",
+}
 NOTE = (
     "{settings} Those with `penalty` or `loss` explore as the base "
-    "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of {size} of the "
-    "rewards, and `penalty=0` is the base algorithm. Scores are of {acting}: the mean over the test {tests}, as "
+    "does, `fast` and `task` are guided. A `penalty` is of so much, or by default of {size}, "
+    "and `penalty=0` is the base algorithm. Scores are of {acting}: the mean over the test {tests}, as "
     "the interquartile mean over seeds with its 95 % bootstrap interval. Steps until the {goal} are medians over "
     "seeds, in which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. "
     "*Mistakes* is the share of all training steps that the AP function labels non-permissible, and *in excess* what "
@@ -74,13 +80,12 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     improvements = improvement(results, scores, kind)
     if not improvements.empty:
         write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
-    on_policy = all(each.algo in ON_POLICY_ALGORITHMS for each in results.configurations)
+    on_policy = {each.algo in ON_POLICY_ALGORITHMS for each in results.configurations}
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
         settings=EQUAL_BUDGET.get(kind, SHARED),
-        # The presets of `zoo_configs`: PPO has a smaller penalty, and its loss has none beside it.
-        size="a quarter of the root mean square" if on_policy else "the root mean square",
-        acting="the actor alone" if laps or not on_policy else "the policy, with its masks where it has learned some",
+        size=SIZES[False not in on_policy, True not in on_policy],
+        acting="the actor alone" if laps or True not in on_policy else "the policy, on-policy with its learned masks",
         reference=reference,
         good="linear feedback" if laps else "the configuration that ends best",
         tests="tracks (without Spring, whose long lap is driven at the end only)" if laps else "episodes",

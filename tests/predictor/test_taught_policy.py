@@ -5,7 +5,10 @@ import copy
 import numpy as np
 import pytest
 import torch as th
-from toy import SMALL_FITS, build, line_log, towards_centre
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from toy import GUIDED, SMALL_FITS, Line, build, line_log, towards_centre
 
 from sb3_sap import DDPGAP, DQNAP, SACAP
 from sb3_sap.guidance import taught_policy
@@ -52,6 +55,31 @@ def test_critics_of_a_held_policy_learn_its_values():
     with th.no_grad():
         values = model.critic(th.as_tensor(obs), th.as_tensor(actions))[0][:, 0].numpy()
     np.testing.assert_allclose(values, -obs[:, 0], atol=0.06)
+
+
+@pytest.mark.parametrize("kind", [*GUIDED, "n_steps", "normalised", "hindsight"])
+def test_whatever_the_algorithm_and_buffer_critics_learn_and_the_actor_stays(kind):
+    settings = {"t_k": 0, "learning_starts": 0, "ap_function": towards_centre} | SMALL_FITS
+    log, algorithm = line_log(300), kind if isinstance(kind, type) else SACAP
+    if kind == "n_steps":
+        settings["n_steps"] = 3
+    elif kind == "normalised":
+        settings["env"] = VecNormalize(make_vec_env(Line), norm_reward=False)
+    elif kind == "hindsight":
+        hindsight = {"replay_buffer_class": HerReplayBuffer, "policy": "MultiInputPolicy", "env": Line("goal")}
+        settings |= hindsight | {"ap_function": lambda o, a, n: np.ones(len(a), dtype=bool)}
+        goals = {"achieved_goal": log["obs"][:, :1], "desired_goal": np.zeros((300, 1), np.float32)}
+        space = settings["env"].observation_space
+        log["obs"] = {key: goals.get(key, log["obs"]).reshape(300, *space[key].shape) for key in space}
+        log["next_obs"] = log["obs"]
+        log["dones"] = np.arange(300) % 10 == 9
+    model = build(algorithm, **settings)
+    model.add_knowledge(log)
+    model.teach_policy(1, hold=5, critic_steps=0)
+    actor, critic = states(model.actor, model.critic)
+    model._teach_critics(3)
+    assert equal(actor, model.actor.state_dict())
+    assert not equal(critic, model.critic.state_dict())
 
 
 def test_policy_is_released_gradually():

@@ -30,6 +30,8 @@ EARLY_SHARES = (0.2, 0.3, 0.5, 0.7, 1.0)
 PENALTY = "base+penalty"
 #: The override that makes it the base algorithm.
 NO_PENALTY = ("penalty", "0")
+#: Returns up to this size are told with two digits.
+SMALL = 10.0
 #: S on every track from which a lap-driving policy has learned the task.
 GOOD = 0.95
 #: What the settings of the configurations have in common.
@@ -179,7 +181,7 @@ def _row(
     own = scores[scores["configuration"] == name]
     last = own["checkpoint"].max()
     row = {"configuration": name, "seeds": str(own["seed"].nunique())}
-    digits = 3 if results.simulator in ENVIRONMENTS else 1
+    digits = 3 if results.simulator in ENVIRONMENTS else 1 if own["score"].abs().max() > SMALL else 2
     for share in shares:
         values = _at(scores, name, share)
         if len(values) == 0:  # no evaluation so early

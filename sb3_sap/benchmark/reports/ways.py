@@ -181,7 +181,7 @@ def _row(
     own = scores[scores["configuration"] == name]
     last = own["checkpoint"].max()
     row = {"configuration": name, "seeds": str(own["seed"].nunique())}
-    digits = 3 if results.simulator in ENVIRONMENTS else 1 if own["score"].abs().max() > SMALL else 2
+    digits = 3 if results.simulator in ENVIRONMENTS else 1 if scores["score"].abs().max() > SMALL else 2
     for share in shares:
         values = _at(scores, name, share)
         if len(values) == 0:  # no evaluation so early

@@ -8,12 +8,15 @@ from sb3_sap.benchmark import started
 from sb3_sap.benchmark.started import DDPGAPStarted, log
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
+from sb3_sap.guidance import taught_policy
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(started, "AGENT_STEPS", 300)
     monkeypatch.setattr(started, "LOG_STEPS", 400)
+    for module in (started, taught_policy):
+        monkeypatch.setattr(module, "CRITIC_STEPS", 20)
 
 
 def model(start, source="embedded"):

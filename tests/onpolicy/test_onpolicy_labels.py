@@ -217,6 +217,7 @@ class Nearer(Line):
         return obs, 10 * (before - abs(self.x)), *rest
 
 
+@pytest.mark.slow
 def test_loss_follows_the_agreement():
     """Labels that the advantages contradict are predicted well, and yet the model equals its base to the bit."""
     settings = {"n_steps": 64, "gamma": 0.0, "learning_rate": 0.0}

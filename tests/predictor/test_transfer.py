@@ -268,6 +268,7 @@ def test_predictor_is_fitted_before_the_first_step_and_trusted():
     assert len(env.executed) == 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch_size", [16, 64])
 def test_few_examples_are_fitted_beyond_the_plateau_at_the_start(batch_size):
     log = line_log(150)
@@ -335,6 +336,7 @@ def test_taught_stochastic_policy_explores_around_what_is_permitted():
     assert drawn.std() == pytest.approx(SPREAD, rel=0.3)
 
 
+@pytest.mark.slow
 def test_taught_policy_moves_no_further_than_e_demands():
     model, _ = known(policy_kwargs={"net_arch": [32]}, learning_rate=0.01)
     model.fit_predictor()
@@ -419,6 +421,7 @@ def test_policy_cannot_be_taught_by_nothing():
         build(DQNAP).teach_policy(imitate=True)
 
 
+@pytest.mark.slow
 def test_predictor_that_is_right_too_seldom_teaches_with_a_warning(recwarn):
     model, _ = known()
     model.fit_predictor()
@@ -438,6 +441,7 @@ def test_frozen_predictor_stays_as_it_is():
     assert all(th.equal(value, before[name]) for name, value in model.predictor.state_dict().items())
 
 
+@pytest.mark.slow
 def test_wrong_knowledge_is_noticed_and_unlearned():
     model, _ = known(log=line_log(wrong=True), t_k=0, learning_starts=0)
     model.fit_predictor(epochs=6)

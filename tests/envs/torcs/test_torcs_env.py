@@ -181,6 +181,7 @@ def test_resets_use_no_further_memory(torcs):
     assert resident() - before < 2_000
 
 
+@pytest.mark.slow
 def test_library_copies_are_used_again(torcs):
     def copies():
         gc.collect()

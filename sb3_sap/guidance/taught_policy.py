@@ -57,10 +57,12 @@ class TaughtPolicyMixin(AuxiliaryLossMixin):
         coef: Any = getattr(self, "log_ent_coef", None)
         held += [] if coef is None else [coef]
         before = [tensor.detach().clone() for tensor in held]
-        yield
-        with th.no_grad():
-            for tensor, old in zip(held, before, strict=True):
-                tensor.copy_(old.lerp(tensor, share) if share and old.is_floating_point() else old)
+        try:
+            yield
+        finally:  # also where the user interrupts a training
+            with th.no_grad():
+                for tensor, old in zip(held, before, strict=True):
+                    tensor.copy_(old.lerp(tensor, share) if share and old.is_floating_point() else old)
 
     def teach_policy(
         self, steps: int = 1_000, hold: int = 0, imitate: bool | None = None, critic_steps: int | None = None
@@ -126,13 +128,14 @@ class TaughtPolicyMixin(AuxiliaryLossMixin):
     def _teach_critics(self, steps: int) -> None:
         """Trains the critics alone, on what is in the replay buffer."""
         model = cast(Any, self)
-        outputs = getattr(model, "_logger", None)
+        outputs, updates = getattr(model, "_logger", None), self._n_updates
         model._logger = Logger(None, [])  # ``learn`` opens the outputs of the user
         try:
             for _ in range(steps):
                 with self._held_back():  # after each step, because the target follows the actor
-                    super().train(gradient_steps=1, batch_size=self.batch_size)
+                    super(AuxiliaryLossMixin, self).train(gradient_steps=1, batch_size=self.batch_size)
         finally:
+            self._n_updates = updates  # by which the auxiliary loss counts updates of the actor
             if outputs is None:
                 del model._logger
             else:

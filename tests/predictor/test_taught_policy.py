@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import DDPG
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -35,7 +36,7 @@ def test_critics_learn_from_the_log_what_a_held_policy_is_worth(algorithm):
     actor, critic = states(model.actor, model.critic)
     entropy = model.log_ent_coef.item() if algorithm is SACAP else None
     model.teach_policy(1, hold=30, critic_steps=50)
-    assert model._n_updates == 50
+    assert model._n_updates == 0  # the auxiliary loss counts updates of the actor by it
     assert not equal(critic, model.critic.state_dict())
     if algorithm is SACAP:
         assert model.log_ent_coef.item() == entropy
@@ -100,6 +101,22 @@ def test_policy_is_released_gradually():
     assert (model.held_until, model.released_at) == (20, 40)
 
 
+def test_interrupted_training_leaves_a_held_policy_as_it_was(monkeypatch):
+    model = known()
+    model.teach_policy(5, hold=20, critic_steps=0)
+    (actor,) = states(model.actor)
+
+    def interrupted(self, gradient_steps, batch_size=64):
+        next(self.actor.parameters()).data.add_(1.0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(DDPG, "train", interrupted)
+    for train in (lambda: model._teach_critics(1), lambda: model.train(1)):
+        with pytest.raises(KeyboardInterrupt):
+            train()
+        assert equal(actor, model.actor.state_dict())
+
+
 def test_released_policy_continues_in_a_loaded_model(tmp_path):
     model = known()
     model.teach_policy(50, hold=20, critic_steps=0)
@@ -111,12 +128,14 @@ def test_released_policy_continues_in_a_loaded_model(tmp_path):
 
 def test_critics_are_not_taught_where_nothing_is_known_to_them(monkeypatch):
     model = known(into="knowledge")
+    (critic,) = states(model.critic)
     model.teach_policy(5, hold=10)
-    assert model._n_updates == 0
+    assert equal(critic, model.critic.state_dict())
     monkeypatch.setattr(taught_policy, "CRITIC_STEPS", 3)
     both = known()
+    (critic,) = states(both.critic)
     both.teach_policy(5, hold=10)
-    assert both._n_updates == 3
+    assert not equal(critic, both.critic.state_dict())
     for bad in ({"hold": 10, "critic_steps": 5}, {"hold": 0, "critic_steps": 5}, {"hold": 10, "critic_steps": -1}):
         with pytest.raises(ValueError, match="needs continuous actions, a `hold` above 0 and transitions with rewards"):
             model.teach_policy(5, **bad)

@@ -47,11 +47,11 @@ EQUAL_BUDGET = {
         "other tracks; the presets were among the draws."
     ),
 }
-#: The penalty of the presets of `zoo_configs`, by whether all configurations are on-policy, and whether none is.
+#: The penalty of the presets of `zoo_configs`, where configurations are on-policy, off-policy, or of both kinds.
 SIZES = {
-    (True, False): "a quarter of the root mean square of the rewards",
-    (False, True): "the root mean square of the rewards",
-    (False, False): "the root mean square of the rewards, on-policy a quarter of it",
+    frozenset({True}): "a quarter of the root mean square of the rewards",
+    frozenset({False}): "the root mean square of the rewards",
+    frozenset({True, False}): "the root mean square of the rewards, on-policy a quarter of it",
 }
 NOTE = (
     "{settings} Those with `penalty` or `loss` explore as the base "
@@ -82,12 +82,12 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     improvements = improvement(results, scores, kind)
     if not improvements.empty:
         write_csv(folder / f"{kind}_improvement.csv", improvements.round(6))
-    on_policy = {each.algo in ON_POLICY_ALGORITHMS for each in results.configurations}
+    on_policy = frozenset(each.algo in ON_POLICY_ALGORITHMS for each in results.configurations)
     goal = f"every lap done with S of at least {GOOD}" if laps else f"mean return {target_return(results.simulator):g}"
     note = NOTE.format(
         settings=EQUAL_BUDGET.get(kind, SHARED),
-        size=SIZES[False not in on_policy, True not in on_policy],
-        acting="the actor alone" if laps or True not in on_policy else "the policy, on-policy with its learned masks",
+        size=SIZES[on_policy],
+        acting="the actor alone" if laps or True not in on_policy else "the policy, on-policy with learned masks",
         reference=reference,
         good="linear feedback" if laps else "the configuration that ends best",
         tests="tracks (without Spring, whose long lap is driven at the end only)" if laps else "episodes",

@@ -81,7 +81,8 @@ def all_switches(obs: Any, actions: Any, next_obs: Any) -> Any:
 CASES: dict[str, dict[str, Any]] = {
     "PPO alone": {"ap_function": all_switches, "alpha": 0},
     "the preset of the penalty": {"ap_function": all_switches, **preset("penalty", PPOAP)},
-    "the best penalty": {"ap_function": all_switches, **preset("penalty", PPOAP), "penalty": "auto"},
+    "the best penalty": {"ap_function": all_switches, **preset("penalty", PPOAP), "penalty": 1.0},
+    "the best that follows the rewards": {"ap_function": all_switches, **preset("penalty", PPOAP), "penalty": "auto"},
     "loss": {"ap_function": all_switches, **preset("loss", PPOAP)},
     "one label, block after block": {"ap_function": all_switches},
     "a label for each dimension": {

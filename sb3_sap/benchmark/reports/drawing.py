@@ -128,5 +128,6 @@ def _scale_steps(axes: Any, label: str) -> None:
 
 
 def _line(axes: Any, number: int, name: str, x: Any, y: Any, low: Any, high: Any) -> None:
-    axes.plot(x, y, label=name, color=f"C{number}", linewidth=1.3)
+    # There are ten colours.
+    axes.plot(x, y, label=name, color=f"C{number}", linestyle="-" if number < 10 else "--", linewidth=1.3)
     axes.fill_between(x, low, high, color=f"C{number}", alpha=0.12, linewidth=0)

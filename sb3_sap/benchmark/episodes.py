@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_sap.benchmark.task_settings import entry
+from sb3_sap.common.acting import Actor
 from sb3_sap.common.functions import resolve
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.permissibility import APFunction, query_labels
@@ -35,10 +36,13 @@ def evaluation(
         del checkpoint  # all are alike
         episodes = [Episode(env, int(seed)) for env, seed in zip(envs, seeds, strict=True)]
         # The episodes run side by side, because a small network takes as long for one observation as for all.
-        while running := [episode for episode in episodes if not episode.done]:
-            actions, _ = policy.predict(_stacked([episode.obs for episode in running]), deterministic=True)
+        act, running = Actor(policy), episodes
+        while running:
+            actions = act(_stacked([episode.obs for episode in running]))
             for episode, action in zip(running, actions, strict=True):
                 episode.step(action)
+            act.keep(np.array([not episode.done for episode in running]))
+            running = [episode for episode in running if not episode.done]
         return [[seed, *episode.row(ap_function)] for seed, episode in zip(seeds, episodes, strict=True)]
 
     return evaluate

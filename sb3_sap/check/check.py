@@ -14,6 +14,7 @@ from sb3_sap.check.classifier import ClassifierResult, fit_classifier
 from sb3_sap.check.parts import InfoOfPart, OfPart
 from sb3_sap.check.report import PermissibilityReport
 from sb3_sap.check.trials import label, rollout, try_actions
+from sb3_sap.common.acting import Actor
 from sb3_sap.common.action_parts import ActionParts
 from sb3_sap.common.arrays import stack_observations
 from sb3_sap.common.functions import resolve
@@ -96,7 +97,7 @@ def check_permissibility(
         return reports
     act = None if policy is None else _action_function(policy, env.action_space)
     env.action_space.seed(seed)
-    transitions = rollout(env, lambda _: env.action_space.sample(), n_steps, seed)
+    transitions = rollout(env, lambda *_: env.action_space.sample(), n_steps, seed)
     labels = label(transitions, function)
     action_matters, label_changes = try_actions(env, function, seed)
     result = fit_classifier(
@@ -120,12 +121,14 @@ def check_permissibility(
     return report
 
 
-def _action_function(policy: Any, space: gym.Space[Any]) -> Callable[[Any], Any]:
+def _action_function(policy: Any, space: gym.Space[Any]) -> Callable[[Any, bool], Any]:
     if not (hasattr(policy, "predict") or callable(policy)):
         raise TypeError(f"`policy` must have SB3's `predict` or be a function (obs) -> action, but is {policy!r}.")
 
-    def act(obs: Any) -> Any:
-        action = policy.predict(obs, deterministic=True)[0] if hasattr(policy, "predict") else policy(obs)
+    actor = Actor(policy) if hasattr(policy, "predict") else None
+
+    def act(obs: Any, starts: bool) -> Any:
+        action = policy(obs) if actor is None else actor(obs, starts)
         numbers = np.asarray(action)
         if numbers.dtype.kind not in "biuf" or numbers.shape != space.shape:
             raise ValueError(f"`policy` must return one action of {space} for one observation, but gave {action!r}.")

@@ -31,16 +31,19 @@ class Transition(NamedTuple):
     info: dict[str, Any]
 
 
-def rollout(env: gym.Env[Any, Any], act: Callable[[Any], Any], n_steps: int, seed: int) -> list[Transition]:
-    """Steps through an environment, from episode to episode, with the actions that ``act`` chooses."""
+def rollout(env: gym.Env[Any, Any], act: Callable[[Any, bool], Any], n_steps: int, seed: int) -> list[Transition]:
+    """Steps through an environment, from episode to episode.
+
+    :param act: chooses the action for an observation, and whether an episode begins with it
+    """
     transitions: list[Transition] = []
-    obs = _reset(env, seed)
+    obs, starts = _reset(env, seed), True
     while len(transitions) < n_steps:
         obs = copy_observation(obs)
-        action = act(obs)
-        next_obs, ended, info = _step(env, action)
+        action = act(obs, starts)
+        next_obs, starts, info = _step(env, action)
         transitions.append(Transition(obs, action, copy_observation(next_obs), info))
-        obs = _reset(env, None) if ended else next_obs
+        obs = _reset(env, None) if starts else next_obs
     return transitions
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 
+from sb3_sap.common.acting import Actor
 from sb3_sap.common.files import atomic_path
 from sb3_sap.envs import CarState
 from sb3_sap.evaluation.laps import ENVIRONMENTS
@@ -35,12 +36,13 @@ def animate(policy: Any, simulator: str, speed: float, path: Path, console: Cons
     guided = getattr(policy, "predictor", None) is not None and policy.predictor.fitted
     steering = np.linspace(-1, 1, FAN_ANGLES)[:, None]
     frames: list[Image.Image] = []
+    act = Actor(policy)
     obs, info = env.reset(seed=0)
     done = False
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("animation", total=ANIMATION_STEPS)
         while not done and len(frames) < ANIMATION_STEPS:
-            action, _ = policy.predict(obs, deterministic=True)
+            action = act(obs)
             fan = permissible_probability(policy, obs[None], steering)[0] if guided else None
             state = CarState(*(info[name] for name in CarState._fields))
             frames.append(Image.fromarray(viewer.draw(state, float(action[0]), fan)).quantize(64))

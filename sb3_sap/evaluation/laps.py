@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from sb3_sap.common.acting import Actor
 from sb3_sap.common.files import atomic_path
 from sb3_sap.envs import score
 
@@ -38,11 +39,11 @@ def drive(policy: Any, env: gym.Env[Any, Any]) -> Iterator[tuple[float, dict[str
     :param policy: a model or policy with SB3's ``predict``
     :return: (reward, info) of each step
     """
+    act = Actor(policy)
     obs, _ = env.reset(seed=0)
     done = False
     while not done:
-        action, _ = policy.predict(obs, deterministic=True)
-        obs, reward, terminated, truncated, info = env.step(action)
+        obs, reward, terminated, truncated, info = env.step(act(obs))
         done = terminated or truncated
         yield float(reward), info
 

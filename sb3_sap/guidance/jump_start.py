@@ -8,8 +8,10 @@ from typing import Any, Protocol, cast
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 
+from sb3_sap.common.acting import Actor
 from sb3_sap.common.arrays import copy_observation
 from sb3_sap.common.errors import check_at_least
 from sb3_sap.common.functions import resolve
@@ -50,6 +52,7 @@ class JumpStartMixin(SettingsMixin):
         self.guide_policy = guide_policy
         self.guide_steps = guide_steps
         self.guide_end = guide_end
+        self._guide: Actor | None = None
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -72,6 +75,15 @@ class JumpStartMixin(SettingsMixin):
         scaled = np.where(chosen.reshape(-1, *(1,) * (own.ndim - 1)), guides, own).astype(own.dtype)
         return self._in_units(scaled), scaled
 
+    def _store_transition(
+        self, replay_buffer: ReplayBuffer, buffer_action: Any, new_obs: Any, reward: Any, dones: Any, infos: Any
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._last_episode_starts = dones  # SB3 keeps it for on-policy algorithms alone
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_guide"]
+
     def _actions_of_guide(self, n_envs: int) -> np.ndarray[Any, Any]:
         """(n_envs, *action_shape) scaled actions of the guide.
 
@@ -80,8 +92,9 @@ class JumpStartMixin(SettingsMixin):
         space, obs = cast(Any, self.action_space), copy_observation(self.raw_last_obs())
         guide: Any = self.guide_policy
         if hasattr(guide, "predict"):
-            given = guide.predict(obs, deterministic=True)
-            given = given[0] if isinstance(given, tuple) else given
+            if self._guide is None or self._guide.policy is not guide:
+                self._guide = Actor(guide)
+            given = self._guide(obs, self._last_episode_starts)
         else:
             given = resolve(guide, "guide_policy")(obs)
         actions = np.asarray(given)

@@ -37,12 +37,14 @@ RATES = {"learning_rate": ["0.0003", "0.001", "0.002"]}
 NOISE = {"action_noise": ["null", '{"type":"normal","sigma":0.1}', '{"type":"normal","sigma":0.3}']}
 ENTROPY = {"ent_coef": ["auto", "auto_0.1"]}
 ROLLOUTS = {"learning_rate": ["0.0003", "0.001", "lin_0.001", "lin_0.002"], "n_steps": ["128", "256", "512"]}
+# SB3's first deviation of 1 is wide for actions from -1 to 1.
+DEVIATIONS = {"policy_kwargs.log_std_init": ["0", "-1"]}
 SHARED: dict[str, dict[str, list[str]]] = {
     "ddpg_ap": RATES | DISCOUNTS | NOISE,
     "td3_ap": RATES | DISCOUNTS | NOISE,
     "sac_ap": RATES | DISCOUNTS | ENTROPY,
     "tqc_ap": RATES | DISCOUNTS | ENTROPY,
-    "ppo_ap": ROLLOUTS | DISCOUNTS,
+    "ppo_ap": ROLLOUTS | DISCOUNTS | DEVIATIONS,
 }
 #: The potentials of each task, of which the second is tried first.
 POTENTIALS = {

@@ -1,20 +1,25 @@
 """What the runs of `sb3-sap benchmark starts` begin with."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 
-from sb3_sap.benchmark import started
-from sb3_sap.benchmark.started import DDPGAPStarted, log
+from sb3_sap.benchmark import logs, started
+from sb3_sap.benchmark.logs import log
+from sb3_sap.benchmark.started import DDPGAPStarted
+from sb3_sap.benchmark.task_settings import entry
+from sb3_sap.common.functions import resolve
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.guidance import taught_policy
+from sb3_sap.tasks import mountain_car_continuous
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     monkeypatch.setattr(started, "AGENT_STEPS", 300)
-    monkeypatch.setattr(started, "LOG_STEPS", 400)
+    monkeypatch.setattr(logs, "LOG_STEPS", 400)
     for module in (started, taught_policy):
         monkeypatch.setattr(module, "CRITIC_STEPS", 20)
 
@@ -82,6 +87,31 @@ def test_logs_are_labelled_and_reproducible():
     wrong = log("wrong", "highway", 100)
     assert (wrong.labels != one.labels).mean() == pytest.approx(0.1, abs=0.05)
     assert (log("region", "highway", 100).obs[:, 1] <= 0).all()
+
+
+@pytest.mark.parametrize("env_id", ["MountainCarContinuous-v0", "FetchReach-v4"])
+def test_controllers_of_tasks_do_what_is_permissible(env_id):
+    if env_id.startswith("Fetch"):
+        pytest.importorskip("gymnasium_robotics")
+    function = resolve(entry("", env_id)["ap_function"], "ap_function")
+    good, random = log("log", env_id, 100), log("random", env_id, 100)
+    assert good.labels is None
+    assert good.rewards.sum() > random.rewards.sum()
+    shares = [function(one.obs, one.actions, one.next_obs).mean() for one in (good, random)]
+    assert shares[0] > 0.8 > shares[1]
+
+
+def test_a_task_logs_in_itself():
+    one = DDPGAPStarted(
+        "MlpPolicy",
+        gym.make("MountainCarContinuous-v0"),
+        start="cloned",
+        source="log",
+        seed=100,
+        ap_function=mountain_car_continuous,
+    )
+    one._prepare()
+    assert one.replay_buffer.prior[0].observations.shape[-1] == 2
 
 
 def test_unknown_start_is_refused():

@@ -45,7 +45,9 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     _add_configurations(command, [])
     _add_grid(command, lane_keeping=False)
     _add_workers(command)
-    command.add_argument("--report", choices=["returns", "ways"], default="returns", help="the page that is written")
+    command.add_argument(
+        "--report", choices=["returns", "ways", "starts"], default="returns", help="the page that is written"
+    )
     command.set_defaults(run=_with_extra(actions.task))
     command = added.add_parser("report", help="write all reports of lane keeping from the results that exist")
     _add_grid(command)

@@ -68,11 +68,11 @@ def report(options: argparse.Namespace, console: Console) -> int:
 
 def task(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of a task beyond lane keeping and writes its page."""
-    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, task_configurations, ways_of
+    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, starts_of, task_configurations, ways_of
 
     options.tracks = list(EPISODES)
     options.steps = options.steps or planned_steps(options.simulator)
-    compared = ways_of if options.report == "ways" else task_configurations
+    compared = {"returns": task_configurations, "ways": ways_of, "starts": starts_of}[options.report]
     options.configurations = options.configurations or compared(options.simulator)
     failed = _run_missing(options, options.steps, console)
     _write(options, options.report, console)

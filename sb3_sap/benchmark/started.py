@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Self
 
-import numpy as np
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.algorithms import DDPGAP, SACAP
 from sb3_sap.benchmark.cloning import clone
-from sb3_sap.benchmark.linear import GAINS, LinearFeedback
+from sb3_sap.benchmark.logs import log
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.guidance.taught_policy import CRITIC_STEPS
 from sb3_sap.presets import preset
-from sb3_sap.transitions.batch import Transitions
 from sb3_sap.transitions.sources import batches_of, joined
 
 #: What a run begins with: nothing; the predictor of the source, which teaches the policy; its policy, or both; its
@@ -24,13 +21,10 @@ from sb3_sap.transitions.sources import batches_of, joined
 STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "imitated", "taught")
 #: Those that teach the policy what E permits.
 TAUGHT = ("predictor", "taught")
-#: Where it comes from: an agent on the embedded simulator; on the simulator of the run itself a linear controller with
-#: noise, the same with one label in ten wrong, the same without steps left of the centre line, or random actions.
+#: Where it comes from: an agent on the embedded simulator, or a log of the simulator or the task of the run itself.
 SOURCES = ("embedded", "log", "wrong", "region", "random")
-#: Steps of the agent, and of the logs.
-AGENT_STEPS, LOG_STEPS = 1_000, 20_000
-#: Standard deviation of the noise of the linear controller.
-NOISE = 0.3
+#: Steps of the agent.
+AGENT_STEPS = 1_000
 #: Timesteps for which a policy that was taught or cloned stays as it is.
 HOLD = 150
 
@@ -40,7 +34,7 @@ class StartedMixin:
 
     :param start: one of `STARTS`
     :param source: one of `SOURCES`; from a log there is no policy to take over
-    :param source_simulator: that of the log
+    :param source_simulator: that of the log of lane keeping
     """
 
     def __init__(
@@ -58,7 +52,7 @@ class StartedMixin:
             kwargs |= {"learning_starts": 0, "t_k": 0}
         if start in TAUGHT:  # on design seeds they lapsed once the loss had faded
             kwargs |= {"permissibility_coef": 1.0}
-        super().__init__(*args, ap_function="sb3_sap.envs.ap_function", **kwargs)  # type: ignore[call-arg]
+        super().__init__(*args, **{"ap_function": "sb3_sap.envs.ap_function"} | kwargs)
 
     def learn(self, total_timesteps: int = 1_000, callback: MaybeCallback = None, **kwargs: Any) -> Self:
         """SB3's ``learn``, before which the start is prepared."""
@@ -73,7 +67,9 @@ class StartedMixin:
             donor = agent(type(self).__mro__[2], self.seed)
             transitions = donor.replay_buffer
         else:
-            transitions = log(self.source, self.source_simulator, self.seed)
+            task = self.env.get_attr("spec")[0].id
+            simulator = self.source_simulator if task in ENVIRONMENTS.values() else task
+            transitions = log(self.source, simulator, self.seed)
         if "policy" in self.start and donor is not None:
             self.policy.load_state_dict(donor.policy.state_dict())
         if self.start == "cloned":
@@ -101,27 +97,6 @@ def agent(cls: Any, seed: int) -> Any:
     env = make_env(ENVIRONMENTS["highway"], track="wheel-2", laps=None)
     settings = preset("fast", cls, AGENT_STEPS) | {"ap_function": "sb3_sap.envs.ap_function"}
     return cls("MlpPolicy", env, seed=seed, device="cpu", **settings).learn(AGENT_STEPS)
-
-
-def log(kind: str, simulator: str, seed: int) -> Transitions:
-    """What a linear controller with noise, or random actions, did on a simulator."""
-    env, rng = make_env(ENVIRONMENTS[simulator], track="wheel-2", laps=None), np.random.default_rng([seed, 28])
-    driver, rows = LinearFeedback(**GAINS[simulator]), []
-    obs, _ = env.reset(seed=seed)
-    for _ in range(LOG_STEPS):
-        action = driver.predict(obs)[0] + rng.normal(0, NOISE, 1) if kind != "random" else rng.uniform(-1, 1, 1)
-        action = np.clip(action, -1, 1).astype(np.float32)
-        next_obs, reward, terminated, truncated, info = env.step(action)
-        rows.append(
-            (obs, action, next_obs, reward, terminated or truncated, truncated and not terminated, info["permissible"])
-        )
-        obs = env.reset()[0] if terminated or truncated else next_obs
-    env.close()
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    made = Transitions(*columns)
-    if kind == "wrong":
-        return replace(made, labels=np.logical_xor(columns[-1], rng.random(len(made)) < 0.1))
-    return made.rows(np.asarray(made.obs)[:, 1] <= 0) if kind == "region" else made
 
 
 class DDPGAPStarted(StartedMixin, DDPGAP):  # type: ignore[misc]

@@ -116,6 +116,21 @@ def ways_of(env_id: str) -> list[str]:
     ]
 
 
+def starts_of(env_id: str) -> list[str]:
+    """What a run may begin with, from a log of `sb3_sap.benchmark.logs`."""
+    algo = f"{guided_algorithms(env_id)[0]}_started"
+    return [
+        f"{algo}:base+penalty[start=nothing]",
+        f"{algo}:base+loss[start=nothing]",
+        f"{algo}:base+penalty[start=replay,source=log]",
+        *(
+            f"{algo}:base+{presets}[start={start},source={source}]"
+            for source in ("log", "random")
+            for presets, start in (("penalty", "cloned"), ("loss", "imitated"))
+        ),
+    ]
+
+
 def planned_steps(env_id: str) -> int:
     """Training steps of the first guided algorithm with an entry."""
     return int(entry(guided_algorithms(env_id)[0], env_id)["n_timesteps"])

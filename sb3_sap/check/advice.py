@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sb3_sap.check.report import PermissibilityReport, percent
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 #: Below this share, or above one minus it, examples of one class are rare.
 RARE = 0.02

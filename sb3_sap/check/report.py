@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 #: Action dimensions that the report lists, the most informative first.
 LISTED = 8

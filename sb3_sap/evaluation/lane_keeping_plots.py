@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from sb3_sap.envs.lane_keeping import OBSERVATION_SCALE
 from sb3_sap.evaluation.predictor_plots import RESOLUTION, draw_permissibility
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 #: Steps of the moving average of Fig. 4(a).
 WINDOW = 100

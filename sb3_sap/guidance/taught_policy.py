@@ -15,7 +15,7 @@ from torch import nn
 
 from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
 from sb3_sap.guidance.teaching import cloning_step, taught_step
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 #: Networks that are held still together.
 ACTORS = ("actor", "actor_target")

@@ -20,8 +20,9 @@ from sb3_sap.common.spaces import check_action_space, check_observation_space
 from sb3_sap.common.torch_utils import flush_denormals, own_generators
 from sb3_sap.guidance.candidates import candidate_actions, choose
 from sb3_sap.permissibility import ActionPermissibility, labels_from_infos
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 from sb3_sap.predictor.knowledge import KnowledgeBuffer
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY, PermissibilityPredictor
+from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.pairs import query_candidates
 from sb3_sap.predictor.schedule import check_growth, due
 from sb3_sap.predictor.weights import check_same_spaces, check_statistics

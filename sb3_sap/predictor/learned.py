@@ -20,9 +20,10 @@ from sb3_sap.common.watching import WatchedEnvironmentMixin
 from sb3_sap.permissibility import APFunction, does_not_lower
 from sb3_sap.predictor.building import make_predictor
 from sb3_sap.predictor.events import Event, event_source
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 from sb3_sap.predictor.knowledge import KnowledgeBuffer, LabelledActions
 from sb3_sap.predictor.labelling import Labels
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY, PermissibilityPredictor
+from sb3_sap.predictor.network import PermissibilityPredictor
 from sb3_sap.predictor.optimizer_state import check_same_optimizer, settings_of
 from sb3_sap.predictor.pending import Pending
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 
 @dataclass(frozen=True)

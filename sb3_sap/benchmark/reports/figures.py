@@ -11,7 +11,7 @@ from sb3_sap.benchmark.reports.measures import LOST
 from sb3_sap.benchmark.reports.pages import markdown, write_csv, write_figure, write_page
 from sb3_sap.benchmark.reports.results import NoResults, Results
 from sb3_sap.benchmark.reports.tables import curve_table
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 #: Training steps that Figure 5 shows.
 ACCURACY_STEPS = 5_000

@@ -11,7 +11,7 @@ from sb3_sap.benchmark.reports.figures import ACCURACY_STEPS, with_averages
 from sb3_sap.benchmark.reports.measures import median_reached
 from sb3_sap.benchmark.reports.results import Results
 from sb3_sap.evaluation.statistics import interquartile_mean
-from sb3_sap.predictor.network import SUFFICIENT_ACCURACY
+from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 DDPG, CE1, CE2, AP, AP_CE2 = (f"{algo}:paper" for algo in ("ddpg", "ddpg_ce1", "ddpg_ce2", "ddpg_ap", "ddpg_ap_ce2"))
 #: Default speed in km/h, which is the reward of a perfect step.

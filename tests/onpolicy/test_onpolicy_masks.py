@@ -2,6 +2,7 @@
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import sb3_contrib
@@ -24,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stubs import above, deny
 from toy import Line
 
-from sb3_sap import A2CAP, PPOAP, TRPOAP
+from sb3_sap import A2CAP, PPOAP, TRPOAP, RecurrentPPOAP
 
 
 @pytest.mark.parametrize("algorithm", BASES)
@@ -157,6 +158,60 @@ def test_continuous_action_is_the_first_permissible_draw_with_its_own_log_probab
     share = np.exp(normal - buffer.log_probs.reshape(-1))
     assert share.mean() == pytest.approx(0.5, abs=0.1)
     assert share.std() < 0.2
+
+
+class Asks(BaseCallback):
+    """Somebody else asks the policy amid a rollout."""
+
+    def _on_step(self):
+        self.model.policy(self.locals["obs_tensor"])
+        return True
+
+
+@pytest.mark.parametrize("algorithm", [PPOAP, A2CAP])
+@pytest.mark.parametrize("kind", ["array", "dict"])
+@pytest.mark.parametrize("callback", [None, Asks], ids=["alone", "asked"])
+def test_update_evaluates_the_rollout_with_its_own_shares(algorithm, kind, callback):
+    env = DummyVecEnv([lambda: Line(kind=kind)] * 3)
+    policy = "MlpPolicy" if kind == "array" else "MultiInputPolicy"
+    model = judged_by(above(0.0), algorithm, env, policy=policy, learning_rate=0.0, n_steps=8)
+    if kind == "dict":
+        model.predictor.features = lambda obs: obs["time"]
+    model.learn(24, callback=callback and callback())
+    data = next(model.rollout_buffer.get(24))
+    with model._guided_by(model._rollout_guide):
+        _, log_prob, _ = model.policy.evaluate_actions(data.observations, data.actions)
+    with th.no_grad():
+        alone = model.policy.get_distribution(data.observations).log_prob(data.actions)
+    th.testing.assert_close(log_prob, data.old_log_prob, atol=1e-5, rtol=0)
+    assert (log_prob - alone).mean().item() == pytest.approx(math.log(2), abs=0.2)
+
+
+class Blind(gym.ObservationWrapper):
+    """All observations are alike, so that only the memory tells states apart."""
+
+    def observation(self, observation):
+        return 0 * observation
+
+
+def test_states_that_look_alike_have_the_share_of_their_own_memory():
+    model = judged_by(above(0.0), RecurrentPPOAP, Blind(Line()), learning_rate=0.0, n_steps=16, n_candidates=4_000)
+    model.policy.action_net.weight.data.mul_(300)  # the mean moves with the memory
+    model.learn(16)
+    buffer = model.rollout_buffer
+    data = next(buffer.get(16))
+    with model._guided_by(model._rollout_guide), th.no_grad():
+        mean = model.policy.get_distribution(data.observations, data.lstm_states.pi, data.episode_starts)[0]
+        _, log_prob, _ = model.policy.evaluate_actions(
+            data.observations, data.actions, data.lstm_states, data.episode_starts
+        )
+    mean = mean.distribution.mean[:, 0]
+    assert mean.std() > 0.1
+    rows = data.mask > 0.5
+    alone = -0.5 * math.log(2 * math.pi) - 0.5 * (data.actions[:, 0] - mean) ** 2
+    expected = alone - th.special.ndtr(mean).log()
+    th.testing.assert_close(data.old_log_prob[rows], expected[rows], atol=0.1, rtol=0)
+    th.testing.assert_close(log_prob[rows], data.old_log_prob[rows], atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("sde", [False, True])

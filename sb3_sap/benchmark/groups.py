@@ -108,14 +108,14 @@ GROUPS: dict[str, list[str]] = {
     ],
     # The recommended use of the label, on more seeds: how many runs fail?
     "failing": [f"{algo}:base+penalty" for algo in ("ddpg_ap", "td3_ap", "sac_ap", "tqc_ap")],
-    # The same for PPO, with the winners of the search; the presets of the penalty and the loss are among its draws.
+    # The same for PPO, with the winners of the search, and the preset of the loss.
     "on_policy": [
-        "ppo_ap:base+penalty[penalty=0]",
-        "ppo_ap:base+penalty[penalty=0,potential=sb3_sap.benchmark.potentials.centre_100]",
-        "ppo_ap:base+penalty",
-        "ppo_ap:base+penalty[learning_rate=0.001,n_steps=512,gamma=0.95,penalty=auto_0.1]",
+        "ppo_ap:base+penalty[penalty=0,learning_rate=lin_0.002]",
+        "ppo_ap:base+penalty[penalty=0,potential=sb3_sap.benchmark.potentials.centre_300,learning_rate=lin_0.002]",
+        "ppo_ap:base+penalty[penalty=auto,learning_rate=lin_0.002]",
+        "ppo_ap:base+loss[learning_rate=lin_0.001,n_steps=512,gamma=0.95,permissibility_coef=lin_10.0]",
+        "ppo_ap:base+loss[alpha=1,learning_rate=lin_0.001,n_steps=512,gamma=0.95,permissibility_coef=lin_3.0]",
         "ppo_ap:base+loss",
-        "ppo_ap:base+loss[alpha=1]",
     ],
     # What a run begins with, from an agent on the embedded simulator and from logs. A policy that knows something
     # already needs less entropy.

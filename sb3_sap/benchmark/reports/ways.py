@@ -42,8 +42,8 @@ EQUAL_BUDGET = {
         "`measurements/equal_budget.py` made on design seeds and other tracks."
     ),
     "on_policy": (
-        "Each configuration, the penalty without overrides apart, is the best of eight draws of learning rate, γ, "
-        "length of a rollout and a knob of its own, which `measurements/equal_budget.py` made on design seeds and "
+        "Each configuration with overrides is the best of eight draws of learning rate, γ, length of a rollout, first "
+        "deviation of the policy and a knob of its own, which `measurements/equal_budget.py` made on design seeds and "
         "other tracks; the presets were among the draws."
     ),
 }

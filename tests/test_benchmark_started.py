@@ -6,7 +6,7 @@ import pytest
 import torch as th
 
 from sb3_sap.benchmark import logs, started
-from sb3_sap.benchmark.logs import log
+from sb3_sap.benchmark.logs import guide, log
 from sb3_sap.benchmark.started import DDPGAPStarted
 from sb3_sap.benchmark.task_settings import entry
 from sb3_sap.common.functions import resolve
@@ -112,6 +112,19 @@ def test_a_task_logs_in_itself():
     )
     one._prepare()
     assert one.replay_buffer.prior[0].observations.shape[-1] == 2
+
+
+@pytest.mark.parametrize("env_id", ["MountainCarContinuous-v0", "lane keeping"])
+def test_a_guide_acts_first(env_id):
+    if env_id == "lane keeping":
+        one = model("guided", "log")
+    else:
+        env = gym.make(env_id)
+        one = DDPGAPStarted("MlpPolicy", env, start="guided", source="log", ap_function=mountain_car_continuous, seed=1)
+    one.learn(20)
+    assert one.replay_buffer.prior == ()
+    obs, actions = (getattr(one.replay_buffer, name)[:20, 0] for name in ("observations", "actions"))
+    np.testing.assert_allclose(actions, guide(env_id if env_id.startswith("M") else "highway")(obs), atol=1e-6)
 
 
 def test_unknown_start_is_refused():

@@ -132,6 +132,7 @@ GROUPS: dict[str, list[str]] = {
             ("penalty", "cloned"),
             ("loss", "imitated"),
             ("loss", "taught"),
+            ("penalty", "guided,source=log"),
             ("penalty", "replay,source=log"),
             ("penalty", "cloned,source=log"),
             ("loss", "imitated,source=log"),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_sap.benchmark.linear import GAINS, LinearFeedback
-from sb3_sap.common.arrays import copy_observation, stack_observations
+from sb3_sap.common.arrays import copy_observation, rows_of, stack_observations
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.tasks.reach import NEAR
@@ -43,6 +43,16 @@ CONTROLLERS: dict[str, Callable[[Any], Any]] = {
     "FetchReach-v4": towards_the_goal,
     **{simulator: partial(linear, LinearFeedback(**gains)) for simulator, gains in GAINS.items()},
 }
+
+
+def guide(simulator: str) -> Callable[[Any], Any]:
+    """The controller of a simulator or a task, for a batch of observations."""
+    return partial(_of_batch, CONTROLLERS[simulator])
+
+
+def _of_batch(controller: Callable[[Any], Any], obs: Any) -> Any:
+    n = len(next(iter(obs.values())) if isinstance(obs, dict) else obs)
+    return np.stack([controller(rows_of(obs, row)) for row in range(n)])
 
 
 def log(kind: str, simulator: str, seed: int) -> Transitions:

@@ -8,7 +8,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_sap.algorithms import DDPGAP, SACAP
 from sb3_sap.benchmark.cloning import clone
-from sb3_sap.benchmark.logs import log
+from sb3_sap.benchmark.logs import guide, log
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS
 from sb3_sap.guidance.taught_policy import CRITIC_STEPS
@@ -17,8 +17,8 @@ from sb3_sap.transitions.sources import batches_of, joined
 
 #: What a run begins with: nothing; the predictor of the source, which teaches the policy; its policy, or both; its
 #: transitions with their rewards; beside those a policy that imitates all of its actions, or the permissible ones, or
-#: that E has taught.
-STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "imitated", "taught")
+#: that E has taught; or the controller of the log as a guide.
+STARTS = ("nothing", "predictor", "policy", "policy_predictor", "replay", "cloned", "imitated", "taught", "guided")
 #: Those that teach the policy what E permits.
 TAUGHT = ("predictor", "taught")
 #: Where it comes from: an agent on the embedded simulator, or a log of the simulator or the task of the run itself.
@@ -45,10 +45,11 @@ class StartedMixin:
         source_simulator: str = "torcs",
         **kwargs: Any,
     ):
-        if start not in STARTS or source not in SOURCES or (source != "embedded" and "policy" in start):
+        possible = {"guided": source == "log", "policy": source == "embedded", "policy_predictor": source == "embedded"}
+        if start not in STARTS or source not in SOURCES or not possible.get(start, True):
             raise ValueError(f"There is no start {start!r} from the source {source!r}.")
         self.start, self.source, self.source_simulator = start, source, source_simulator
-        if start != "nothing":
+        if start not in ("nothing", "guided"):
             kwargs |= {"learning_starts": 0, "t_k": 0}
         if start in TAUGHT:  # on design seeds they lapsed once the loss had faded
             kwargs |= {"permissibility_coef": 1.0}
@@ -61,14 +62,17 @@ class StartedMixin:
         return super().learn(total_timesteps, callback, **kwargs)  # type: ignore[misc, no-any-return]
 
     def _prepare(self: Any) -> None:
+        task = self.env.get_attr("spec")[0].id
+        simulator = self.source_simulator if task in ENVIRONMENTS.values() else task
         donor: Any = None
         transitions: Any
+        if self.start == "guided":
+            self.guide_policy = guide(simulator)
+            return
         if self.source == "embedded":
             donor = agent(type(self).__mro__[2], self.seed)
             transitions = donor.replay_buffer
         else:
-            task = self.env.get_attr("spec")[0].id
-            simulator = self.source_simulator if task in ENVIRONMENTS.values() else task
             transitions = log(self.source, simulator, self.seed)
         if "policy" in self.start and donor is not None:
             self.policy.load_state_dict(donor.policy.state_dict())

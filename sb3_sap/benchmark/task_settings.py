@@ -122,6 +122,7 @@ def starts_of(env_id: str) -> list[str]:
     return [
         f"{algo}:base+penalty[start=nothing]",
         f"{algo}:base+loss[start=nothing]",
+        f"{algo}:base+penalty[start=guided,source=log]",
         f"{algo}:base+penalty[start=replay,source=log]",
         *(
             f"{algo}:base+{presets}[start={start},source={source}]"

@@ -1,7 +1,7 @@
 """Measures what permissibility costs per training step of PPO: PPOAP beside PPO with the same settings.
 
 `mask` and `draws` are `alpha=1`, the masks of finite actions and the draws of continuous ones; `loss` is the preset of
-that name; `small E` has two hidden layers of 64 units instead of 128 and 256. The two models of a pair train in turn, a
+that name; `an output each` gives E an output for each action. The two models of a pair train in turn, a
 rollout at a time, in one process and thread, so that other work on the machine affects both. The parts are measured
 inside the guided model.
 
@@ -104,7 +104,7 @@ CASES = {
 }
 WAYS = {
     "cartpole": ("mask", "loss"),
-    "actions": ("mask", "loss", "mask, small E", "loss, small E"),
+    "actions": ("mask", "loss", "mask, an output each", "loss, an output each"),
     "torcs": ("draws", "loss"),
 }
 TITLES = {
@@ -132,8 +132,8 @@ def measure(name: str, way: str) -> dict[str, object]:
     """One row: milliseconds per step of both models, and of the parts of the guided one."""
     case = CASES[name]
     own: dict[str, Any] = preset("loss", PPOAP) if way.startswith("loss") else {"alpha": 1}
-    if way.endswith("small E"):
-        own["predictor_kwargs"] = {"net_arch": [64, 64]}
+    if way.endswith("an output each"):
+        own["predictor_kwargs"] = {"output_per_action": True}
     arguments: dict[str, Any] = {"policy": "MlpPolicy", "seed": 100, "device": "cpu", **case.settings}
     models: list[Any] = [
         PPO(env=case.make_env(), **arguments),

@@ -6,6 +6,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 
 from sb3_sap.common.errors import is_number
 
@@ -21,6 +22,16 @@ def optimizer_named(optimizer_class: type[th.optim.Optimizer] | str) -> type[th.
     if not (isinstance(found, type) and issubclass(found, th.optim.Optimizer)):
         raise ValueError(f"`optimizer_class` = {optimizer_class!r} names no optimizer of torch.optim, such as 'Adam'.")
     return found
+
+
+def checked_output_per_action(value: Any, space: spaces.Space[Any], parts: bool) -> bool:
+    """:raise ValueError: with one sentence, if E cannot have an output for each action"""
+    if value not in (True, False):
+        raise ValueError(f"`output_per_action` must be True or False, but is {value!r}.")
+    if value and (parts or not isinstance(space, spaces.Discrete)):
+        what = "`action_parts`" if parts else f"the action space {space}"
+        raise ValueError(f"`output_per_action` is for Discrete actions without parts, not for {what}: leave it out.")
+    return bool(value)
 
 
 def check_arguments(net_arch: Any, batch_size: Any, learning_rate: Any, threshold: Any) -> None:

@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import nn
 
 from sb3_sap.common.action_parts import ActionParts
-from sb3_sap.predictor.arguments import check_arguments, optimizer_named
+from sb3_sap.predictor.arguments import check_arguments, checked_output_per_action, optimizer_named
 from sb3_sap.predictor.encoding import encoded_actions, own_inputs
 
 #: Balanced validation accuracy from which E is accurate enough for α; below it, ``alpha_low`` holds (section 4.3).
@@ -44,6 +44,7 @@ class JudgingNetwork(BaseModel):
         normalize_images: bool = True,
         action_parts: Mapping[str, Sequence[int]] | None = None,
         threshold: float = 0.5,
+        output_per_action: bool = False,
     ):
         optimizer_class = optimizer_named(optimizer_class)
         check_arguments(net_arch, batch_size, learning_rate, threshold)
@@ -58,6 +59,7 @@ class JudgingNetwork(BaseModel):
         )
         self.batch_size = batch_size
         self.parts = ActionParts.of(action_parts, action_space)
+        self.output_per_action = checked_output_per_action(output_per_action, action_space, bool(self.parts))
         #: What verdicts subtract from the logit of the probability, so that above zero means permissible.
         self.offset = math.log(threshold / (1 - threshold))
         self._arguments = {
@@ -68,10 +70,13 @@ class JudgingNetwork(BaseModel):
             "batch_size": batch_size,
             "action_parts": self.parts.as_dict(),
             "threshold": threshold,
+            "output_per_action": output_per_action,
         }
         self.features_extractor = self.make_features_extractor()
-        n_inputs = self.features_extractor.features_dim + get_flattened_obs_dim(action_space)
-        self.head = nn.Sequential(*create_mlp(n_inputs, len(self.parts) or 1, list(net_arch), activation_fn))
+        of_action = get_flattened_obs_dim(action_space)  # inputs, or outputs
+        n_inputs = self.features_extractor.features_dim + (0 if output_per_action else of_action)
+        n_outputs = of_action if output_per_action else len(self.parts) or 1
+        self.head = nn.Sequential(*create_mlp(n_inputs, n_outputs, list(net_arch), activation_fn))
         self._normalises_batches = any(isinstance(layer, nn.modules.batchnorm._BatchNorm) for layer in self.modules())
         # Seeds the random layers, such as dropout, of each fit.
         self._seed = th.initial_seed()
@@ -136,6 +141,8 @@ class JudgingNetwork(BaseModel):
 
     def raw_logits(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """(n, k) logits of the probabilities themselves; without parts (n, 1)."""
+        if self.output_per_action:
+            return self.head(features).gather(1, actions.reshape(-1, 1).long())  # type: ignore[no-any-return]
         # A float64 action space brings float64 actions.
         encoded = encoded_actions(self.action_space, actions).to(features.dtype)
         if self.own_inputs is None:

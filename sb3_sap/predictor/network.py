@@ -45,6 +45,8 @@ class PermissibilityPredictor(JudgingNetwork):
     :param features_extractor_kwargs: its arguments
     :param normalize_images: as in SB3's policies
     :param action_parts: names of parts of the action with their dimensions, which have labels of their own
+    :param output_per_action: for ``Discrete`` actions, whether E has an output for each action instead of an input, so
+        that one pass judges all of them, which is far faster for hundreds
     :param threshold: probability, between 0 and 1, above which an action counts as permissible
     """
 

@@ -24,6 +24,8 @@ def judge(
     :param actions: (m, n, action_dim), scaled
     :param part: the part of the action that is judged; None: the whole
     """
+    if predictor.output_per_action:
+        return predictor.head(features).gather(1, actions[..., 0].long()) - predictor.offset  # type: ignore[no-any-return]
     m, n = actions.shape[:2]
     pairs = features.expand(n, -1) if m == 1 else features.repeat_interleave(n, dim=0), actions.reshape(m * n, -1)
     logits = predictor.logits(*pairs) if part is None else predictor.part_logits(*pairs)[:, part]
@@ -65,6 +67,9 @@ class ManyActions:
 
         :param batches: (n, features_dim) features
         """
+        if self.predictor.output_per_action:
+            chosen = self.actions.flatten().long()
+            return [self.predictor.head(batch)[:, chosen] - self.predictor.offset for batch in batches]
         if self._fitted != int(self.predictor.n_updates):
             self._shares, self._fitted = self._shares_now(), int(self.predictor.n_updates)
         found: Iterable[th.Tensor]

@@ -218,6 +218,49 @@ def test_many_actions_are_judged_as_each_of_them_is(space):
     th.testing.assert_close(judge(e, features, some)[2, 1], each[2, 4])
 
 
+def test_an_output_for_each_action_judges_all_of_them_alike():
+    space = spaces.Discrete(7)
+    e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), space, net_arch=[8], output_per_action=True, threshold=0.3)
+    features, actions = th.rand(4, 3), th.arange(7)[:, None]
+    each = e.logits(features.repeat_interleave(7, dim=0), actions.repeat(4, 1)).reshape(4, 7)
+    th.testing.assert_close(each, e.head(features) - e.offset)
+    th.testing.assert_close(judge(e, features, actions.expand(4, -1, -1)), each)
+    th.testing.assert_close(judge(e, features[:1], actions[None, 3:5]), each[:1, 3:5])
+    th.testing.assert_close(th.cat(ManyActions(e, actions[2:]).logits(features.split(3))), each[:, 2:])
+
+
+def test_an_output_for_each_action_learns_and_is_saved(tmp_path):
+    e = PermissibilityPredictor(spaces.Box(-1, 1, (1,)), spaces.Discrete(30), net_arch=[32], output_per_action=True)
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        obs, actions = rng.uniform(-1, 1, (512, 1)), rng.integers(0, 30, (512, 1))
+        e.fit(dataset(obs, actions, (actions[:, 0] / 15 - 1 < obs[:, 0])))
+    obs, actions = rng.uniform(-1, 1, (1000, 1)), rng.integers(0, 30, (1000, 1))
+    assert min(e.recall(dataset(obs, actions, actions[:, 0] / 15 - 1 < obs[:, 0]))) > 0.9
+    e.save(tmp_path / "e.pt")
+    loaded = PermissibilityPredictor.load(tmp_path / "e.pt")
+    assert loaded.output_per_action
+    th.testing.assert_close(loaded.probabilities(obs, actions), e.probabilities(obs, actions))
+
+
+@pytest.mark.parametrize(
+    ("space", "parts", "said"),
+    [
+        (ACTIONS, None, "for the action space Box"),
+        (spaces.MultiDiscrete([2, 2]), None, "for the action space MultiDiscrete"),
+        (spaces.MultiDiscrete([2, 2]), {"one": [0], "other": [1]}, "for `action_parts`"),
+    ],
+)
+def test_an_output_for_each_action_needs_single_actions(space, parts, said):
+    with pytest.raises(ValueError, match=f"`output_per_action` is for Discrete actions without parts, not {said}"):
+        PermissibilityPredictor(OBS, space, action_parts=parts, output_per_action=True)
+
+
+def test_output_per_action_is_a_yes_or_no():
+    with pytest.raises(ValueError, match="`output_per_action` must be True or False, but is 3"):
+        PermissibilityPredictor(OBS, spaces.Discrete(3), output_per_action=3)
+
+
 def test_actions_are_judged_anew_after_a_fit():
     e = PermissibilityPredictor(spaces.Box(-1, 1, (3,)), spaces.Discrete(5), net_arch=[8])
     many, features = ManyActions(e, th.arange(5)), th.rand(2, 3)

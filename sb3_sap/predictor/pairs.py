@@ -24,7 +24,7 @@ def judge(
     :param actions: (m, n, action_dim), scaled
     :param part: the part of the action that is judged; None: the whole
     """
-    if predictor.output_per_action:
+    if getattr(predictor, "output_per_action", False):  # anything that has `logits` may judge
         return predictor.head(features).gather(1, actions[..., 0].long()) - predictor.offset  # type: ignore[no-any-return]
     m, n = actions.shape[:2]
     pairs = features.expand(n, -1) if m == 1 else features.repeat_interleave(n, dim=0), actions.reshape(m * n, -1)

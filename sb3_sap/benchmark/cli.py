@@ -46,7 +46,9 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     _add_grid(command, lane_keeping=False)
     _add_workers(command)
     command.add_argument(
-        "--report", choices=["returns", "ways", "starts"], default="returns", help="the page that is written"
+        "--report",
+        choices=["returns", "ways", "starts", "races"],
+        help="the page that is written; None: races of sap/TorcsRacing-v0, else returns",
     )
     command.set_defaults(run=_with_extra(actions.task))
     command = added.add_parser("report", help="write all reports of lane keeping from the results that exist")

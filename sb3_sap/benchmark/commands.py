@@ -13,6 +13,7 @@ from rich.console import Console
 
 from sb3_sap.benchmark.paper import TEST_TRACKS
 from sb3_sap.evaluation.laps import ENVIRONMENTS
+from sb3_sap.evaluation.racing import RACING
 
 if TYPE_CHECKING:
     from sb3_sap.benchmark.configurations import Configuration
@@ -46,6 +47,8 @@ REPORTS = {
 SUMMARIES = ("summary", "ablations", "details", "readings", "auxiliary", "robustness")
 #: Reports that compare ways of using the label.
 WAYS = ("ways", "failing", "equal_budget", "on_policy", "wrong_labels", "starts")
+#: Tracks of racing: that of the training, and those of the test.
+RACE_TRACKS = ("wheel-2", *TEST_TRACKS)
 #: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
 LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.
@@ -68,11 +71,22 @@ def report(options: argparse.Namespace, console: Console) -> int:
 
 def task(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of a task beyond lane keeping and writes its page."""
-    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps, starts_of, task_configurations, ways_of
+    from sb3_sap.benchmark.task_settings import (
+        EPISODES,
+        planned_steps,
+        races_of,
+        starts_of,
+        task_configurations,
+        ways_of,
+    )
 
-    options.tracks = list(EPISODES)
+    races = options.simulator == RACING
+    options.tracks = list(RACE_TRACKS if races else EPISODES)
+    options.report = options.report or ("races" if races else "returns")
+    if races != (options.report == "races"):
+        raise ValueError(f"The report 'races' is for {RACING}, and no other report is: leave --report out.")
     options.steps = options.steps or planned_steps(options.simulator)
-    compared = {"returns": task_configurations, "ways": ways_of, "starts": starts_of}[options.report]
+    compared = {"returns": task_configurations, "ways": ways_of, "starts": starts_of, "races": races_of}[options.report]
     options.configurations = options.configurations or compared(options.simulator)
     failed = _run_missing(options, options.steps, console)
     _write(options, options.report, console)
@@ -128,7 +142,7 @@ def _run_missing(options: argparse.Namespace, steps: int, console: Console) -> i
 
 
 def _write(options: argparse.Namespace, name: str, console: Console, leave_out_unknown: bool = False) -> None:
-    from sb3_sap.benchmark.reports import figures, returns, summary, tables, ways
+    from sb3_sap.benchmark.reports import figures, races, returns, summary, tables, ways
     from sb3_sap.benchmark.reports.results import collect
 
     folder = _folder(options, options.steps)
@@ -142,6 +156,7 @@ def _write(options: argparse.Namespace, name: str, console: Console, leave_out_u
         "headline": tables.headline,
         **{kind: partial(summary.summary, name=kind) for kind in SUMMARIES},
         "returns": returns.returns,
+        "races": races.races,
         **{kind: partial(ways.ways, kind=kind) for kind in WAYS},
     }
     writers[name](results, folder, command_line(options, name))
@@ -175,7 +190,7 @@ def _grid(options: argparse.Namespace, steps: int, console: Console | None = Non
     from sb3_sap.benchmark.runs import make_grid
 
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    later = LONG_LAPS if getattr(options, "report", None) in WAYS else ()
+    later = LONG_LAPS if getattr(options, "report", None) in (*WAYS, "races") else ()
     grid: dict[Configuration, list[Run]] = {}
     left_out: dict[str, ValueError] = {}
     for configuration in parse_configurations(options.configurations):
@@ -202,7 +217,7 @@ def command_line(options: argparse.Namespace, name: str) -> str:
     """The command that makes a report, without the flags that do not change it."""
     beyond = options.simulator not in ENVIRONMENTS
     words = ["sb3-sap", "benchmark", *(["task"] if beyond else [name, "--simulator"]), options.simulator]
-    words += ["--report", name] if beyond and name != "returns" else []
+    words += ["--report", name] if beyond and name not in ("returns", "races") else []
     words += [] if name == "claims" else ["--steps", str(options.steps)]
     words += ["--seeds", str(options.seeds)]
     words += ["--first-seed", str(options.first_seed)] if options.first_seed else []

@@ -19,8 +19,9 @@ from sb3_sap.common.yaml_text import read_yaml
 #: ``algo``, ``algo:preset`` or ``algo:preset[key=value,…]``.
 _CONFIGURATION = re.compile(r"(?P<algo>\w+)(:(?P<preset>\w+(\+\w+)*))?(\[(?P<overrides>.+)\])?")
 
-#: Controllers that do not learn and have no presets: linear feedback and the look-ahead oracle.
-CONTROLLERS = ("linear", "oracle")
+#: Controllers that do not learn and have no presets: linear feedback, the look-ahead oracle, and the driver of racing
+#: that is written down.
+CONTROLLERS = ("linear", "oracle", "scripted")
 #: Overrides of the run instead of a setting: its number of training steps, and how many of the seeds are run.
 RUN_OPTIONS = ("steps", "seeds")
 

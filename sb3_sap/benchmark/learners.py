@@ -21,7 +21,9 @@ from sb3_sap.common.extractors import with_extractor
 from sb3_sap.common.functions import resolve
 from sb3_sap.common.schedules import as_schedule
 from sb3_sap.common.settings import SettingsMixin
+from sb3_sap.envs.torcs.scripted import DECELERATION
 from sb3_sap.evaluation.laps import ENVIRONMENTS
+from sb3_sap.evaluation.racing import RACING
 from sb3_sap.onpolicy.algorithms import ON_POLICY_ALGORITHMS
 from sb3_sap.onpolicy.mixin import OnPolicyPermissibilityMixin
 from sb3_sap.presets import preset
@@ -119,13 +121,18 @@ def settings_of(configuration: Configuration, simulator: str, steps: int) -> dic
 
 
 def _of_controller(algo: str, simulator: str) -> dict[str, Any]:
-    """Parameters of a controller: gains of the linear one, the AP function of the look-ahead oracle."""
+    """Parameters of a controller: gains of the linear one, the AP function of the look-ahead oracle, and so on."""
     if algo == "linear" and simulator in GAINS:
         return dict(GAINS[simulator])
     if algo == "oracle" and simulator not in ENVIRONMENTS and has_oracle(simulator):
         return {"ap_function": entry(algo, simulator)["ap_function"]}
-    needed = "a task whose entry in zoo_configs names an AP function, and that can be copied"
-    needed = "lane keeping" if algo == "linear" else needed
+    if algo == "scripted" and simulator == RACING:
+        return {"deceleration": DECELERATION}
+    needed = {
+        "linear": "lane keeping",
+        "oracle": "a task whose entry in zoo_configs names an AP function, and that can be copied",
+        "scripted": RACING,
+    }[algo]
     raise ValueError(f"The configuration {algo} is for {needed}, but {simulator} is not.")
 
 

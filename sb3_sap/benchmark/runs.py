@@ -19,6 +19,8 @@ from sb3_sap.evaluation.laps import ENVIRONMENTS
 CHECKPOINTS = (100, 150, 200, 250, 350, 500, 750, 1000, 1500, 2000, 3000, 5000, 7500, 10000, 12500, 15000)
 #: Options of the training environment that define the task, so that the test laps are driven with them as well.
 TASK_OPTIONS = ("speed", "control_step", "car")
+#: Controllers that act alike whatever the seed.
+DETERMINISTIC = ("linear", "scripted")
 
 
 @dataclass(frozen=True)
@@ -127,13 +129,15 @@ def make_grid(
     tracks: Iterable[str] = TEST_TRACKS,
     at_the_end: Iterable[str] = (),
 ) -> dict[Configuration, list[Run]]:
-    """The runs of every configuration, one for each seed; the linear controller is deterministic and has one run."""
+    """The runs of every configuration, one for each seed; controllers that are deterministic have one run."""
     seeds, tracks = list(seeds), list(tracks)
     return {
         configuration: [
             make_run(configuration, simulator, steps, seed, tracks, at_the_end)
             for seed in (
-                seeds[: configuration.run_option("seeds", len(seeds))] if configuration.algo != "linear" else [0]
+                seeds[: configuration.run_option("seeds", len(seeds))]
+                if configuration.algo not in DETERMINISTIC
+                else [0]
             )
         ]
         for configuration in configurations

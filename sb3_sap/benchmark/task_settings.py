@@ -116,6 +116,11 @@ def ways_of(env_id: str) -> list[str]:
     ]
 
 
+def races_of(env_id: str) -> list[str]:
+    """The ways of using the label in racing, and the driver that is written down."""
+    return [*ways_of(env_id), "scripted"]
+
+
 def starts_of(env_id: str) -> list[str]:
     """What a run may begin with, from a log of `sb3_sap.benchmark.logs`."""
     algo = f"{guided_algorithms(env_id)[0]}_started"

@@ -16,10 +16,14 @@ from sb3_sap.benchmark.oracle import oracle_episodes
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS, Clock, Recorder
 from sb3_sap.benchmark.runs import Run
 from sb3_sap.benchmark.snapshots import SnapshotCallback, resume
+from sb3_sap.envs.torcs.scripted import ScriptedDriver
 from sb3_sap.evaluation.environments import make_env
 from sb3_sap.evaluation.laps import ENVIRONMENTS, lap, lap_env
+from sb3_sap.evaluation.racing import RACING, race
 
 LAP_COLUMNS = ["checkpoint", "track", "lap_done", "covered", "total_reward", "score", "steps"]
+#: ``lap_time`` in s is that of a lap from the grid, and missing where it was not completed; the score is ``covered``.
+RACE_COLUMNS = ["checkpoint", "track", "lap_done", "covered", "lap_time", "score", "steps"]
 
 
 def train_and_evaluate(run: Run, began: float, snapshot: Path | None = None) -> dict[str, Any]:
@@ -31,11 +35,15 @@ def train_and_evaluate(run: Run, began: float, snapshot: Path | None = None) -> 
     clock = Clock(began)
     if run.simulator in ENVIRONMENTS:
         evaluate, columns = _laps(run), LAP_COLUMNS
+    elif run.simulator == RACING:
+        evaluate, columns = _races(run), RACE_COLUMNS
     else:
         evaluate, columns = evaluation(run.simulator, run.algo, run.training, run.tracks), RETURN_COLUMNS
     recorder = Recorder(run.checkpoints, evaluate, clock)
     if run.algo == "linear":
         recorder.laps = [[0, *row] for row in evaluate(LinearFeedback(**run.settings))]
+    elif run.algo == "scripted":
+        recorder.laps = [[0, *row] for row in evaluate(ScriptedDriver(**run.settings), 0)]
     elif run.algo == "oracle":
         played = oracle_episodes(run.simulator, run.settings["ap_function"], run.training, run.tracks, run.seed)
         recorder.laps = [[0, *row] for row in played]
@@ -81,5 +89,22 @@ def _laps(run: Run) -> Callable[..., list[list[Any]]]:
             [r.track, r.lap_done, round(r.covered, 6), round(r.total_reward, 2), round(r.score, 6), r.steps]
             for r in driven
         ]
+
+    return evaluate
+
+
+def _races(run: Run) -> Callable[[Any, int], list[list[Any]]]:
+    """The same for laps against the clock; rows of ``RACE_COLUMNS``."""
+
+    def evaluate(policy: Any, checkpoint: int) -> list[list[Any]]:
+        later = run.at_the_end if checkpoint < run.checkpoints[-1] else []
+        rows = []
+        for track in run.tracks:
+            if track not in later:
+                driven = race(policy, track, **run.task)
+                covered = round(driven.covered, 6)
+                time = None if driven.lap_time is None else round(driven.lap_time, 3)
+                rows.append([track, time is not None, covered, time, covered, len(driven.steps)])
+        return rows
 
     return evaluate

@@ -69,7 +69,7 @@ def test_starts_from_a_log(source):
     cloned, imitated, taught = (model(start, source) for start in ("cloned", "imitated", "taught"))
     for one in (cloned, imitated, taught):
         one._prepare()
-        assert one.held_until == started.HOLD
+        assert one.held_until == (started.HOLD_TAUGHT if one is taught else started.HOLD)
         assert len(one.replay_buffer.prior) == 1
     assert not cloned.predictor.fitted
     assert cloned.knowledge.prior is None

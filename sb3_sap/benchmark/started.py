@@ -25,8 +25,8 @@ TAUGHT = ("predictor", "taught")
 SOURCES = ("embedded", "log", "wrong", "region", "random")
 #: Steps of the agent.
 AGENT_STEPS = 1_000
-#: Timesteps for which a policy that was taught or cloned stays as it is.
-HOLD = 150
+#: Timesteps for which a policy that imitates a log stays as it is, and one that E has taught.
+HOLD, HOLD_TAUGHT = 150, 50
 
 
 class StartedMixin:
@@ -51,8 +51,6 @@ class StartedMixin:
         self.start, self.source, self.source_simulator = start, source, source_simulator
         if start not in ("nothing", "guided"):
             kwargs |= {"learning_starts": 0, "t_k": 0}
-        if start in TAUGHT:  # on design seeds they lapsed once the loss had faded
-            kwargs |= {"permissibility_coef": 1.0}
         super().__init__(*args, **{"ap_function": "sb3_sap.envs.ap_function"} | kwargs)
 
     def learn(self, total_timesteps: int = 1_000, callback: MaybeCallback = None, **kwargs: Any) -> Self:
@@ -93,7 +91,8 @@ class StartedMixin:
             self.predictor_kwargs: Any = {}
             self.set_predictor(donor.predictor)
         if self.start in (*TAUGHT, "imitated"):
-            self.teach_policy(hold=HOLD, imitate=self.start == "imitated")
+            imitates = self.start == "imitated"
+            self.teach_policy(hold=HOLD if imitates else HOLD_TAUGHT, imitate=imitates)
 
 
 def agent(cls: Any, seed: int) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from stable_baselines3.common.logger import Logger
 from torch import nn
 
 from sb3_sap.guidance.auxiliary_update import AuxiliaryLossMixin
-from sb3_sap.guidance.teaching import cloning_step, taught_step
+from sb3_sap.guidance.teaching import cloning_step, taught_step, valuing_step
 from sb3_sap.predictor.judging import SUFFICIENT_ACCURACY
 
 #: Networks that are held still together.
@@ -23,6 +24,11 @@ ACTORS = ("actor", "actor_target")
 TARGETS = (("actor", "actor_target"), ("q_net", "q_net_target"), ("quantile_net", "quantile_net_target"))
 #: Gradient steps of the critics on transitions that are known before the first step.
 CRITIC_STEPS = 2_000
+#: Gradient steps of the critics on what E says, and how much more an action is worth to them that E permits, in root
+#: mean squares of the rewards.
+VALUE_STEPS, WORTH = 1_000, 3.0
+#: Share of the hold after which they take them, so that rewards are known.
+REWARDS_SEEN = 0.1
 
 
 def tensors(module: nn.Module) -> list[th.Tensor]:
@@ -38,9 +44,15 @@ class TaughtPolicyMixin(AuxiliaryLossMixin):
         self.held_until = -1
         #: Timestep from which on it moves as far as its gradients say.
         self.released_at = -1
+        #: Timestep at which critics that know nothing learn what E says; -1: they do not.
+        self.valued_at = -1
         super().__init__(*args, **kwargs)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        if 0 <= self.valued_at <= self.lifetime_steps:
+            self.valued_at = -1
+            if self.predictor_accurate:
+                self._teach_values()
         if self.lifetime_steps >= self.released_at:
             super().train(gradient_steps, batch_size)
             return
@@ -73,6 +85,10 @@ class TaughtPolicyMixin(AuxiliaryLossMixin):
         it moves to what E permits, no further than it demands (:func:`~sb3_sap.guidance.teaching.taught_step`), in the
         states that came with the predictor. The values of discrete actions learn to prefer what E permits
         (:func:`~sb3_sap.guidance.auxiliary_loss.preference_loss`). Target networks follow.
+
+        Critics learn of a held actor from its own actions alone, and then believe that any other would be as good.
+        Those of an actor that E has taught therefore learn first that an action which E permits is worth more than one
+        which it does not, by `WORTH` times the root mean square of the first rewards.
 
         :param steps: gradient steps
         :param hold: timesteps from now on for which a continuous actor stays as it was taught, while the critics learn
@@ -122,8 +138,21 @@ class TaughtPolicyMixin(AuxiliaryLossMixin):
                 getattr(self, target).load_state_dict(getattr(self, own).state_dict())
         self.held_until = self.lifetime_steps + hold if held else -1
         self.released_at = self.held_until + hold if held else -1
+        self.valued_at = self.lifetime_steps + math.ceil(REWARDS_SEEN * hold) if held and not (imitate or knows) else -1
         self._teach_critics(critic_steps)
         return float(np.mean(losses[-max(1, steps // 10) :]))
+
+    def _teach_values(self) -> None:
+        """Trains the critics alone, on what E says of random actions."""
+        model, n = cast(Any, self), self.predictor.batch_size
+        rewards = model.replay_buffer.sample(n, env=model._vec_normalize_env).rewards
+        worth = WORTH * rewards.square().mean().sqrt().item()
+        shape = (n, int(np.prod(cast(Any, self.action_space.shape))))
+        for observations in itertools.islice(self.known_states(n), VALUE_STEPS):
+            tried = self.exploration_rng.uniform(-1, 1, shape).astype(np.float32)
+            valuing_step(model, self.predictor, observations, th.as_tensor(tried, device=self.device), worth)
+        if getattr(model, "critic_target", None) is not None:  # CrossQ has none
+            model.critic_target.load_state_dict(model.critic.state_dict())
 
     def _teach_critics(self, steps: int) -> None:
         """Trains the critics alone, on what is in the replay buffer."""

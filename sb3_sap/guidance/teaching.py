@@ -64,3 +64,32 @@ def cloning_step(actor: Any, observations: Any, actions: th.Tensor) -> float:
     loss.backward()
     actor.optimizer.step()
     return float(loss.item())
+
+
+@flush_denormals()
+def valuing_step(
+    model: Any, predictor: PermissibilityPredictor, observations: Any, actions: th.Tensor, worth: float
+) -> float:
+    """One gradient step of the critics towards Q(s, a) = c · σ(E(s, a)), for actions that nobody has tried.
+
+    What bootstrapping learns afterwards of the actions of one policy raises all values alike and leaves the slope,
+    without which that policy would move to actions whose values are unknown. With parts, σ is the mean over those that
+    are accurate enough.
+
+    :param model: with a ``critic``, and an actor
+    :param observations: n observation tensors
+    :param actions: (n, action_dim), scaled
+    :param worth: c, in units of the reward
+    :return: the loss before the step
+    """
+    model.policy.set_training_mode(False)  # CrossQ's running statistics are of the transitions
+    with th.no_grad():
+        of_parts = predictor.part_logits(predictor.features(observations), actions)
+        permitted = th.sigmoid(of_parts[:, predictor.trusted] if predictor.parts else of_parts).mean(dim=1)
+    values = model.critic(observations, actions)
+    values = values if isinstance(values, tuple) else (values.flatten(1),)  # TQC: (n, critics, quantiles)
+    loss = sum((F.mse_loss(own, (worth * permitted)[:, None].expand_as(own)) for own in values), actions.new_zeros(()))
+    model.critic.optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    model.critic.optimizer.step()
+    return float(loss.item())

@@ -21,13 +21,16 @@ class KnownExamplesMixin(FamiliarityMixin):
     """
 
     def known_states(self, n: int) -> Iterator[Any]:
-        """Batches of n observation tensors, without end, of states that E has learned in.
+        """Batches of n observation tensors, without end, of states that E has learned in: those of the log or K, or
+        those that came with E where they are more.
 
         :raise ValueError: if there are none, or E was not fitted
         """
         source = self.knowledge.prior or self.knowledge
-        states = None if sum(source.counts("train")) else self.predictor.about.get("states")
-        if not (self.predictor.fitted and (states or sum(source.counts("train")))):
+        states, own = self.predictor.about.get("states"), sum(source.counts("train"))
+        if states and len(next(iter(states.values()))) <= own:
+            states = None
+        if not (self.predictor.fitted and (states or own)):
             missing = "E is not fitted: call `fit_predictor` first" if len(source) else "nothing is known"
             raise ValueError(f"The policy cannot be taught, because {missing}.")
         self._begin_statistics(source)

@@ -11,8 +11,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from toy import GUIDED, SMALL_FITS, Line, build, line_log, towards_centre
 
-from sb3_sap import DDPGAP, DQNAP, SACAP
+from sb3_sap import DDPGAP, DQNAP, SACAP, CrossQAP
 from sb3_sap.guidance import taught_policy
+from sb3_sap.guidance.values import q_values
+from sb3_sap.predictor.states import some_states
 
 
 def known(algorithm=DDPGAP, into="both", **settings):
@@ -81,6 +83,67 @@ def test_whatever_the_algorithm_and_buffer_critics_learn_and_the_actor_stays(kin
     model._teach_critics(3)
     assert equal(actor, model.actor.state_dict())
     assert not equal(critic, model.critic.state_dict())
+
+
+def transferred(algorithm=DDPGAP, **settings):
+    """A model whose E came from elsewhere, with the states that it has learned in."""
+    donor = known(DDPGAP, into="knowledge")
+    donor.fit_predictor()
+    donor.predictor.about["states"] = some_states(donor.knowledge.prior)
+    settings = SMALL_FITS | {"predictor_kwargs": {}, "t_k": 0, "learning_starts": 0} | settings
+    model = build(algorithm, ap_function=towards_centre, **settings)
+    model.set_predictor(donor.predictor)
+    return model
+
+
+@pytest.mark.parametrize("algorithm", GUIDED)
+def test_critics_that_know_nothing_learn_what_e_says(algorithm, monkeypatch):
+    """To them an action is worth three root mean squares of the rewards more where E permits it."""
+    monkeypatch.setattr(taught_policy, "VALUE_STEPS", 500)
+    model = transferred(algorithm, learning_rate=0.003, policy_kwargs={"net_arch": [64, 64]})
+    model.teach_policy(50, hold=20)
+    model.learn(1)
+    model.replay_buffer.rewards[:] = -2.0
+    model._teach_values()
+    obs = th.tensor([[0.8, 0.5], [-0.8, 0.5]])
+    outward, inward = th.tensor([[1.0], [-1.0]]), th.tensor([[-1.0], [1.0]])
+    with th.no_grad():
+        gain = q_values(model, obs, inward) - q_values(model, obs, outward)
+    np.testing.assert_allclose(gain.numpy(), 6.0, atol=1.5)
+    if algorithm is not CrossQAP:  # which has no target
+        assert equal(states(model.critic)[0], model.critic_target.state_dict())
+
+
+def test_they_do_so_once_after_the_first_rewards(monkeypatch, tmp_path):
+    taught_at = []
+    monkeypatch.setattr(DDPGAP, "_teach_values", lambda self: taught_at.append(self.lifetime_steps))
+    model = transferred()
+    model.teach_policy(5, hold=40)
+    model.learn(2)
+    model.save(tmp_path / "model")
+    loaded = DDPGAP.load(tmp_path / "model", env=Line())
+    assert (loaded.valued_at, taught_at) == (4, [])
+    model.learn(8, reset_num_timesteps=False)
+    assert taught_at == [4]
+
+
+@pytest.mark.parametrize(("into", "imitate"), [("both", False), ("both", True), ("knowledge", True)])
+def test_critics_that_can_learn_from_transitions_do_not(into, imitate):
+    model = known(into=into)
+    model.fit_predictor()
+    model.teach_policy(1, hold=20, imitate=imitate, critic_steps=0)
+    assert model.valued_at == -1
+
+
+def test_an_e_that_knows_little_does_not_teach_the_critics(monkeypatch):
+    monkeypatch.setattr(DDPGAP, "predictor_accurate", False)
+    model = transferred()
+    with pytest.warns(UserWarning, match="below the"):
+        model.teach_policy(1, hold=20)
+    (critic,) = states(model.critic)
+    monkeypatch.setattr(DDPG, "train", lambda *args, **kwargs: None)
+    model.learn(5)
+    assert equal(critic, model.critic.state_dict())
 
 
 def test_policy_is_released_gradually():

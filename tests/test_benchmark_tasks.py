@@ -13,7 +13,7 @@ from sb3_sap.benchmark.reports.results import collect
 from sb3_sap.benchmark.reports.returns import mean_returns, steps_to_return
 from sb3_sap.benchmark.runs import make_grid, make_run
 from sb3_sap.benchmark.store import write_result
-from sb3_sap.benchmark.task_settings import EPISODES, evaluations, task_configurations
+from sb3_sap.benchmark.task_settings import EPISODES, evaluations, parts_of, task_configurations
 from sb3_sap.benchmark.training import train_and_evaluate
 from sb3_sap.cli.main import main
 from sb3_sap.presets import load_config
@@ -75,6 +75,17 @@ def test_labels_of_parts_are_one_label_in_an_evaluation():
     assert label(gap, np.zeros((2, 4)), nearer).tolist() == [True, False]
     assert label.__name__ == "fetch_reach_axes"
     assert of_whole_action("sb3_sap.tasks.fetch_reach")(gap, np.zeros((2, 4)), nearer).tolist() == [True, True]
+
+
+def test_labels_of_parts_are_compared_with_one_label():
+    whole = "ap_function=sb3_sap.tasks.fetch_reach,action_parts=null"
+    assert parts_of("FetchReach-v4") == [
+        "sac_ap:base+penalty[penalty=0]",
+        *("sac_ap:base+penalty", "sac_ap:base+loss", "sac_ap:task"),
+        *(f"sac_ap:{way}[{whole}]" for way in ("base+penalty", "base+loss", "task")),
+    ]
+    with pytest.raises(ValueError, match=r"one for the whole, which Pendulum-v1 does not have: choose from FetchReach"):
+        parts_of("Pendulum-v1")
 
 
 def test_a_configuration_may_have_fewer_seeds():

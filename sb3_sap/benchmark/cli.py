@@ -47,7 +47,7 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     _add_workers(command)
     command.add_argument(
         "--report",
-        choices=["returns", "ways", "starts", "races"],
+        choices=["returns", "ways", "starts", "parts", "races"],
         help="the page that is written; None: races of sap/TorcsRacing-v0, else returns",
     )
     command.set_defaults(run=_with_extra(actions.task))

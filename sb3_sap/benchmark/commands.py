@@ -46,7 +46,7 @@ REPORTS = {
 #: Reports that are summaries of other configurations.
 SUMMARIES = ("summary", "ablations", "details", "readings", "auxiliary", "robustness")
 #: Reports that compare ways of using the label.
-WAYS = ("ways", "failing", "equal_budget", "on_policy", "wrong_labels", "starts")
+WAYS = ("ways", "failing", "equal_budget", "on_policy", "wrong_labels", "starts", "parts")
 #: Tracks of racing: that of the training, and those of the test.
 RACE_TRACKS = ("wheel-2", *TEST_TRACKS)
 #: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
@@ -71,14 +71,7 @@ def report(options: argparse.Namespace, console: Console) -> int:
 
 def task(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of a task beyond lane keeping and writes its page."""
-    from sb3_sap.benchmark.task_settings import (
-        EPISODES,
-        planned_steps,
-        races_of,
-        starts_of,
-        task_configurations,
-        ways_of,
-    )
+    from sb3_sap.benchmark.task_settings import COMPARED, EPISODES, planned_steps
 
     races = options.simulator == RACING
     options.tracks = list(RACE_TRACKS if races else EPISODES)
@@ -86,7 +79,7 @@ def task(options: argparse.Namespace, console: Console) -> int:
     if races != (options.report == "races"):
         raise ValueError(f"The report 'races' is for {RACING}, and no other report is: leave --report out.")
     options.steps = options.steps or planned_steps(options.simulator)
-    compared = {"returns": task_configurations, "ways": ways_of, "starts": starts_of, "races": races_of}[options.report]
+    compared = COMPARED[options.report]
     options.configurations = options.configurations or compared(options.simulator)
     failed = _run_missing(options, options.steps, console)
     _write(options, options.report, console)

@@ -7,6 +7,7 @@ the score of an episode is its return.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -39,6 +40,8 @@ GOALS = {
 }
 #: The constant reward penalty that did best in a screening on design seeds.
 TUNED_PENALTIES = {"MountainCarContinuous-v0": 0.25, "Pendulum-v1": 0.5, "MountainCar-v0": 1.0, "Acrobot-v1": 1.0}
+#: AP functions of the whole action, of tasks whose entry has labels for parts of it.
+WHOLE_ACTION = {"FetchReach-v4": "sb3_sap.tasks.fetch_reach"}
 #: Presets that are not for lane keeping alone.
 ANY_TASK = ("penalty", "loss")
 #: Settings of guided algorithms that say how labels are used, and not what they are.
@@ -116,6 +119,20 @@ def ways_of(env_id: str) -> list[str]:
     ]
 
 
+def parts_of(env_id: str) -> list[str]:
+    """The ways of using the label, with a label for each part of the action and with one for the whole.
+
+    :raise ValueError: if there are no labels for parts, or no label of the whole action
+    """
+    if env_id not in WHOLE_ACTION:
+        raise ValueError(
+            f"The report 'parts' needs an AP function for parts of the action and one for the whole, which "
+            f"{env_id} does not have: choose from {', '.join(WHOLE_ACTION)}."
+        )
+    ways, whole = ways_of(env_id), f"ap_function={WHOLE_ACTION[env_id]},action_parts=null"
+    return [*ways, *(f"{way}[{whole}]" for way in ways if "[" not in way)]
+
+
 def races_of(env_id: str) -> list[str]:
     """The ways of using the label in racing, and the driver that is written down."""
     return [*ways_of(env_id), "scripted"]
@@ -135,6 +152,16 @@ def starts_of(env_id: str) -> list[str]:
             for presets, start in (("penalty", "cloned"), ("loss", "imitated"))
         ),
     ]
+
+
+#: The configurations of each report.
+COMPARED: dict[str, Callable[[str], list[str]]] = {
+    "returns": task_configurations,
+    "ways": ways_of,
+    "starts": starts_of,
+    "parts": parts_of,
+    "races": races_of,
+}
 
 
 def planned_steps(env_id: str) -> int:

@@ -102,6 +102,7 @@ def ways(results: Results, folder: Path, command: str, kind: str = "ways") -> No
     title = {
         "wrong_labels": "Ways of using the label, with wrong labels",
         "starts": "What a run begins with",
+        "parts": "Labels for parts of the action, and for the whole",
         "failing": "How many runs with the penalty fail",
         "equal_budget": "Ways of using the label, tuned with the same budget",
     }.get(kind, "Ways of using the label")

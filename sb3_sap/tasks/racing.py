@@ -31,8 +31,11 @@ INWARD = 0.5
 BEND, AWAY = np.radians(25), 0.1
 #: Lateral speed of the car itself above which it slides, so that steering against the bend catches it, m/s.
 SLIDING = 1.0
-#: Decelerations, m/s²: what the car does at its best, what it does on any road and in any bend, and less than that.
-BEST, SURE, EASY = 25.0, 6.0, 4.0
+#: Decelerations, m/s²: half of the car's best, because in a bend its tyres have to steer as well; what it does on any
+#: road and in any bend; and less than that.
+HARD, SURE, EASY = 12.0, 6.0, 4.0
+#: Pedal below which the car brakes.
+BRAKE = -0.1
 #: |angle| (rad) and |trackPos| below which a car is well placed.
 PLACED_ANGLE, PLACED_TRACK_POS = 0.35, 0.8
 
@@ -51,14 +54,14 @@ def racing(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
     The pedal is a mistake in three cases, with d the longest free view.
 
-    3. *Too fast for what is in sight*: v² > 2·`BEST`·d, so the car could not stop within its view even with its best
-       braking, and the throttle made it faster still.
+    3. *Too fast for what is in sight*: v² > 2·`HARD`·d, so that stopping within its view takes hard braking, and it did
+       not brake.
     4. *Dawdling*: the car is well placed and v² < 2·`EASY`·d, so that gentle braking would do, but the
        throttle was not used, and the car got no faster. This makes standing still a mistake.
     5. *Braking on an open road*: the car is well placed and v² < 2·`SURE`·d, but it was braked. There is time later.
 
-    *Heuristic.* In a wide, constant bend the view is shorter than what the tyres hold, and 3 forbids to gain speed
-    there; a late apex may want 1 to be broken for a moment.
+    *Heuristic.* In a wide, constant bend the view is shorter than what the tyres hold, and 3 demands to brake there: a
+    driver who knows the road is faster. A late apex may want 1 to be broken for a moment.
 
     :param obs: (n, 30) as the environment returns them
     :param actions: (n, 2) steering, pedal
@@ -89,7 +92,7 @@ def drives_well(obs: Array, pedal: Array, next_obs: Array) -> BoolArray:
     speed, next_speed = obs[:, SPEED_X] * SPEED, next_obs[:, SPEED_X] * SPEED
     needed = np.maximum(speed, 0) ** 2 / (2 * np.maximum(free_view(obs)[0], 1e-6))  # m/s², to stop within the view
     well_placed = (np.abs(obs[:, ANGLE]) < PLACED_ANGLE) & (np.abs(obs[:, TRACK_POS]) < PLACED_TRACK_POS)
-    too_fast = (needed > BEST) & (pedal > 0) & (next_speed > speed)
+    too_fast = (needed > HARD) & (pedal > BRAKE)
     dawdles = well_placed & (needed < EASY) & (pedal <= 0) & (next_speed <= speed)
     brakes = well_placed & (needed < SURE) & (pedal < 0)
     permissible: BoolArray = ~(too_fast | dawdles | brakes)

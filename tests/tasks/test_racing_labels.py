@@ -88,12 +88,12 @@ def test_turning_in_against_the_bend_is_a_mistake_of_the_steering():
     assert not steering(observe(direction=-30), 0.2, observe(direction=-40))
 
 
-def test_throttle_too_fast_for_what_is_in_sight_is_a_mistake_of_the_pedal():
-    # 25 m/s² stop a car of 50 m/s within 50 m
-    assert not pedal(observe(speed=51, view=50), 0.5, observe(speed=51.5, view=45))
-    assert pedal(observe(speed=49, view=50), 0.5, observe(speed=49.5, view=45))
-    assert pedal(observe(speed=51, view=50), -0.5, observe(speed=50, view=45))
-    assert pedal(observe(speed=51, view=50), 0.5, observe(speed=50.9, view=45))  # it did not get faster
+def test_too_fast_for_what_is_in_sight_without_braking_is_a_mistake_of_the_pedal():
+    # 12 m/s² stop a car of 30 m/s within 37.5 m
+    assert not pedal(observe(speed=31, view=37.5), 0.5, observe(speed=31.5, view=35))
+    assert not pedal(observe(speed=31, view=37.5), -0.05, observe(speed=30.8, view=35))  # the engine alone
+    assert pedal(observe(speed=31, view=37.5), -0.5, observe(speed=30, view=35))
+    assert pedal(observe(speed=29, view=37.5), 0.5, observe(speed=29.5, view=35))
 
 
 def test_dawdling_is_a_mistake_of_the_pedal():

@@ -29,6 +29,8 @@ EDGE_TIME = 1.0
 INWARD = 0.5
 #: Direction of the longest free view beyond which the road bends, rad; steering that counts as turning away from it.
 BEND, AWAY = np.radians(25), 0.1
+#: Steering that turns the car, and the angle to the road by which it must not swing past it, rad.
+TURNING, OVERSHOOT = 0.2, 0.1
 #: Lateral speed of the car itself above which it slides, so that steering against the bend catches it, m/s.
 SLIDING = 1.0
 #: Decelerations, m/s²: half of the car's best, because in a bend its tyres have to steer as well; what it does on any
@@ -38,6 +40,9 @@ HARD, SURE, EASY = 12.0, 6.0, 4.0
 BRAKE = -0.1
 #: |angle| (rad) and |trackPos| below which a car is well placed.
 PLACED_ANGLE, PLACED_TRACK_POS = 0.35, 0.8
+#: Speed below which it must go on however it is placed, and the speed across the road at which it does not hold a bend,
+#: m/s.
+CRAWL, CARRIED = 5.0, 1.0
 
 
 def racing(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
@@ -45,22 +50,26 @@ def racing(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
     Each blames a part for what it did and for what came of it, so that one is never blamed for the other.
 
-    The steering is a mistake in two cases.
+    The steering is a mistake in three cases.
 
     1. *Running wide*: at its lateral speed the car reaches the edge within a second, the step made that speed larger,
        and the wheel was not turned at least half way inward. What leaves the road ends the episode.
     2. *Turning in against the bend*: the free view lies to one side, the wheel was turned to the other, the car does
        not slide, and the view then lay still further aside. The road does not go there.
+    3. *Swinging past the road*: the wheel was turned to bring the car's heading back to that of the road, and at the
+       rate of this step the car will point past it, by more than `OVERSHOOT`. A car that weaves slides off at speed.
 
-    The pedal is a mistake in three cases, with d the longest free view.
+    The pedal is a mistake in four cases, with d the longest free view.
 
-    3. *Too fast for what is in sight*: v² > 2·`HARD`·d, so that stopping within its view takes hard braking, and it did
+    4. *Too fast for what is in sight*: v² > 2·`HARD`·d, so that stopping within its view takes hard braking, and it did
        not brake.
-    4. *Dawdling*: the car is well placed and v² < 2·`EASY`·d, so that gentle braking would do, but the
-       throttle was not used, and the car got no faster. This makes standing still a mistake.
-    5. *Braking on an open road*: the car is well placed and v² < 2·`SURE`·d, but it was braked. There is time later.
+    5. *Throttle where the bend carries it out*: the free view still lies to one side, the car moves to the other, and
+       the throttle was used.
+    6. *Dawdling*: the car is well placed or crawls, no bend carries it out, and v² < 2·`EASY`·d, so that gentle braking
+       would do, but the throttle was not used, and the car got no faster. This makes standing still a mistake.
+    7. *Braking on an open road*: the car is well placed and v² < 2·`SURE`·d, but it was braked. There is time later.
 
-    *Heuristic.* In a wide, constant bend the view is shorter than what the tyres hold, and 3 demands to brake there: a
+    *Heuristic.* In a wide, constant bend the view is shorter than what the tyres hold, and 4 demands to brake there: a
     driver who knows the road is faster. A late apex may want 1 to be broken for a moment.
 
     :param obs: (n, 30) as the environment returns them
@@ -83,19 +92,25 @@ def steers_well(obs: Array, steering: Array, next_obs: Array) -> BoolArray:
     bend = np.sign(view)
     slides = np.abs(obs[:, SPEED_Y]) * SPEED > SLIDING
     turns_away = (np.abs(view) > BEND) & (steering * bend < -AWAY) & ~slides & (next_view * bend > np.abs(view))
-    permissible: BoolArray = ~(runs_wide | turns_away)
+    angle, next_angle = obs[:, ANGLE], next_obs[:, ANGLE]
+    later = 2 * next_angle - angle  # at the rate of this step
+    overshoots = (steering * np.sign(angle) > TURNING) & (later * angle < 0) & (np.abs(later) > OVERSHOOT)
+    permissible: BoolArray = ~(runs_wide | turns_away | overshoots)
     return permissible
 
 
 def drives_well(obs: Array, pedal: Array, next_obs: Array) -> BoolArray:
     """Whether the pedal, (n,), is permissible; see `racing`."""
     speed, next_speed = obs[:, SPEED_X] * SPEED, next_obs[:, SPEED_X] * SPEED
-    needed = np.maximum(speed, 0) ** 2 / (2 * np.maximum(free_view(obs)[0], 1e-6))  # m/s², to stop within the view
+    sight, view = free_view(obs)
+    needed = np.maximum(speed, 0) ** 2 / (2 * np.maximum(sight, 1e-6))  # m/s², to stop within the view
     well_placed = (np.abs(obs[:, ANGLE]) < PLACED_ANGLE) & (np.abs(obs[:, TRACK_POS]) < PLACED_TRACK_POS)
     too_fast = (needed > HARD) & (pedal > BRAKE)
-    dawdles = well_placed & (needed < EASY) & (pedal <= 0) & (next_speed <= speed)
+    drifts = (np.abs(view) > BEND) & (-lateral_speed(obs) * np.sign(view) > CARRIED)
+    carried_out = drifts & (pedal > 0)
+    dawdles = (well_placed | (speed < CRAWL)) & ~drifts & (needed < EASY) & (pedal <= 0) & (next_speed <= speed)
     brakes = well_placed & (needed < SURE) & (pedal < 0)
-    permissible: BoolArray = ~(too_fast | dawdles | brakes)
+    permissible: BoolArray = ~(too_fast | carried_out | dawdles | brakes)
     return permissible
 
 

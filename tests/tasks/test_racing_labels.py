@@ -88,12 +88,33 @@ def test_turning_in_against_the_bend_is_a_mistake_of_the_steering():
     assert not steering(observe(direction=-30), 0.2, observe(direction=-40))
 
 
+def test_swinging_past_the_road_is_a_mistake_of_the_steering():
+    # from 0.3 rad to 0.08 in a step: another one like it ends at -0.14
+    assert not steering(observe(angle=0.3), 0.9, observe(angle=0.08))
+    assert not steering(observe(angle=-0.3), -0.9, observe(angle=-0.08))
+    assert steering(observe(angle=0.3), 0.9, observe(angle=0.12))  # ends at -0.06
+    assert steering(observe(angle=0.3), 0.9, observe(angle=0.16))  # not past it
+    assert steering(observe(angle=0.3), 0.1, observe(angle=0.08))  # the wheel was hardly turned
+    assert steering(observe(angle=0.3), -0.9, observe(angle=0.08))  # and here it catches the swing
+
+
 def test_too_fast_for_what_is_in_sight_without_braking_is_a_mistake_of_the_pedal():
     # 12 m/s² stop a car of 30 m/s within 37.5 m
     assert not pedal(observe(speed=31, view=37.5), 0.5, observe(speed=31.5, view=35))
     assert not pedal(observe(speed=31, view=37.5), -0.05, observe(speed=30.8, view=35))  # the engine alone
     assert pedal(observe(speed=31, view=37.5), -0.5, observe(speed=30, view=35))
     assert pedal(observe(speed=29, view=37.5), 0.5, observe(speed=29.5, view=35))
+
+
+def test_throttle_where_a_bend_carries_the_car_out_is_a_mistake_of_the_pedal():
+    # the road goes on to the left; a positive angle is a car that points to the right, at 20·sin 0.1 = 2 m/s
+    bend = {"direction": 40, "view": 100, "angle": 0.1}
+    assert not pedal(observe(**bend), 0.2, observe())
+    assert pedal(observe(**bend), 0.0, observe())
+    assert pedal(observe(**bend | {"angle": 0.04}), 0.2, observe())  # 0.8 m/s
+    assert pedal(observe(**bend | {"angle": -0.1}), 0.2, observe())  # it moves inward
+    assert pedal(observe(**bend | {"direction": 20}), 0.2, observe())  # not much of a bend is left
+    assert not pedal(observe(direction=-40, view=100, angle=-0.1), 0.2, observe())
 
 
 def test_dawdling_is_a_mistake_of_the_pedal():
@@ -106,7 +127,9 @@ def test_dawdling_is_a_mistake_of_the_pedal():
     standing = observe(speed=0, view=50)
     assert not pedal(standing, 0.0, standing)
     assert pedal(standing, 0.5, standing)
-    # badly placed it may be right
+    across = observe(speed=0, view=50, angle=0.5)
+    assert not pedal(across, -0.3, across)
+    # badly placed it may be right at speed
     assert pedal(observe(speed=19, view=50, angle=0.5), 0.0, as_slow)
     assert pedal(observe(speed=19, view=50, track_pos=0.9), 0.0, as_slow)
 
@@ -117,6 +140,19 @@ def test_braking_on_an_open_road_is_a_mistake_of_the_pedal():
     assert pedal(observe(speed=31, view=75), -0.1, observe(speed=30, view=72))
     assert pedal(observe(speed=29, view=75), 0.0, observe(speed=28.9, view=72))
     assert pedal(observe(speed=29, view=75, angle=-0.5), -0.1, observe(speed=28, view=72))
+
+
+def test_some_pedal_is_permissible_in_every_state():
+    rng, pedals = np.random.default_rng(0), np.array([-0.5, 0.0, 0.5])
+    for _ in range(2_000):
+        before = observe(
+            *(rng.uniform(0, 60), rng.uniform(-5, 5), rng.uniform(-0.6, 0.6), rng.uniform(-1, 1), rng.uniform(6, 200)),
+            direction=10 * rng.integers(-6, 7),
+        )
+        after = np.repeat(before, 3, 0)
+        after[:, SPEED_X] += pedals / SPEED
+        labels = racing(np.repeat(before, 3, 0), np.stack([np.zeros(3), pedals], axis=1), after)
+        assert labels[:, 1].any()
 
 
 def test_parts_are_blamed_apart():

@@ -47,10 +47,11 @@ REPORTS = {
 SUMMARIES = ("summary", "ablations", "details", "readings", "auxiliary", "robustness")
 #: Reports that compare ways of using the label.
 WAYS = ("ways", "failing", "equal_budget", "on_policy", "wrong_labels", "starts", "parts")
+#: Tracks that these and racing drive at the last checkpoint only: a lap of Spring takes longer than of all others
+#: together.
+LONG_LAPS = ("spring",)
 #: Tracks of racing: that of the training, and those of the test.
 RACE_TRACKS = ("wheel-2", *TEST_TRACKS)
-#: Tracks that these drive at the last checkpoint only: a lap of Spring takes longer than of all others together.
-LONG_LAPS = ("spring",)
 #: Training steps of the paper's two experiments.
 PAPER_STEPS = (3_000, 15_000)
 #: Readings of how the paper fits its predictor, as groups of configurations, and the file of their claims.

@@ -121,7 +121,7 @@ def settings_of(configuration: Configuration, simulator: str, steps: int) -> dic
 
 
 def _of_controller(algo: str, simulator: str) -> dict[str, Any]:
-    """Parameters of a controller: gains of the linear one, the AP function of the look-ahead oracle, and so on."""
+    """Parameters of a controller: gains, the AP function of the look-ahead oracle, or the deceleration in racing."""
     if algo == "linear" and simulator in GAINS:
         return dict(GAINS[simulator])
     if algo == "oracle" and simulator not in ENVIRONMENTS and has_oracle(simulator):

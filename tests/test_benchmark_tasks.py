@@ -13,7 +13,7 @@ from sb3_sap.benchmark.reports.results import collect
 from sb3_sap.benchmark.reports.returns import mean_returns, steps_to_return
 from sb3_sap.benchmark.runs import make_grid, make_run
 from sb3_sap.benchmark.store import write_result
-from sb3_sap.benchmark.task_settings import EPISODES, evaluations, parts_of, task_configurations
+from sb3_sap.benchmark.task_settings import EPISODES, evaluations, parts_of, races_of, task_configurations
 from sb3_sap.benchmark.training import train_and_evaluate
 from sb3_sap.cli.main import main
 from sb3_sap.presets import load_config
@@ -86,6 +86,13 @@ def test_labels_of_parts_are_compared_with_one_label():
     ]
     with pytest.raises(ValueError, match=r"one for the whole, which Pendulum-v1 does not have: choose from FetchReach"):
         parts_of("Pendulum-v1")
+
+
+def test_racing_is_compared_with_one_label():
+    one_label = "sac_ap:task[ap_function=sb3_sap.tasks.racing_whole,action_parts=null]"
+    assert races_of("sap/TorcsRacing-v0")[-3:] == ["sac_ap:task", one_label, "scripted"]
+    settings = run(one_label, "sap/TorcsRacing-v0").settings
+    assert (settings["ap_function"], settings["action_parts"]) == ("sb3_sap.tasks.racing_whole", None)
 
 
 def test_a_configuration_may_have_fewer_seeds():

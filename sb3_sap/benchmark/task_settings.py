@@ -41,7 +41,10 @@ GOALS = {
 #: The constant reward penalty that did best in a screening on design seeds.
 TUNED_PENALTIES = {"MountainCarContinuous-v0": 0.25, "Pendulum-v1": 0.5, "MountainCar-v0": 1.0, "Acrobot-v1": 1.0}
 #: AP functions of the whole action, of tasks whose entry has labels for parts of it.
-WHOLE_ACTION = {"FetchReach-v4": "sb3_sap.tasks.fetch_reach"}
+WHOLE_ACTION = {
+    "FetchReach-v4": "sb3_sap.tasks.fetch_reach",
+    "sap/TorcsRacing-v0": "sb3_sap.tasks.racing_whole",
+}
 #: Presets that are not for lane keeping alone.
 ANY_TASK = ("penalty", "loss")
 #: Settings of guided algorithms that say how labels are used, and not what they are.
@@ -129,13 +132,19 @@ def parts_of(env_id: str) -> list[str]:
             f"The report 'parts' needs an AP function for parts of the action and one for the whole, which "
             f"{env_id} does not have: choose from {', '.join(WHOLE_ACTION)}."
         )
-    ways, whole = ways_of(env_id), f"ap_function={WHOLE_ACTION[env_id]},action_parts=null"
-    return [*ways, *(f"{way}[{whole}]" for way in ways if "[" not in way)]
+    ways = ways_of(env_id)
+    return [*ways, *(with_one_label(way, env_id) for way in ways if "[" not in way)]
+
+
+def with_one_label(configuration: str, env_id: str) -> str:
+    """A configuration with one label for the whole action."""
+    return f"{configuration}[ap_function={WHOLE_ACTION[env_id]},action_parts=null]"
 
 
 def races_of(env_id: str) -> list[str]:
-    """The ways of using the label in racing, and the driver that is written down."""
-    return [*ways_of(env_id), "scripted"]
+    """The ways of using the label in racing, the entry with one label, and the driver that is written down."""
+    ways = ways_of(env_id)
+    return [*ways, with_one_label(ways[-1], env_id), "scripted"]
 
 
 def starts_of(env_id: str) -> list[str]:

@@ -8,7 +8,7 @@ from sb3_sap.tasks.driving import highway, parking
 from sb3_sap.tasks.energy import acrobot, mountain_car, mountain_car_continuous
 from sb3_sap.tasks.pendulum import pendulum_energy, pendulum_height, pendulum_torque
 from sb3_sap.tasks.racetrack import racetrack
-from sb3_sap.tasks.racing import RACING_PARTS, racing
+from sb3_sap.tasks.racing import RACING_PARTS, racing, racing_whole
 from sb3_sap.tasks.reach import fetch_reach, fetch_reach_axes, nearness
 from sb3_sap.tasks.taxi import taxi
 
@@ -27,5 +27,6 @@ __all__ = [
     "pendulum_torque",
     "racetrack",
     "racing",
+    "racing_whole",
     "taxi",
 ]

@@ -81,6 +81,12 @@ def racing(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     return np.stack([steers_well(obs, steering, next_obs), drives_well(obs, pedal, next_obs)], axis=1)
 
 
+def racing_whole(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
+    """``sap/TorcsRacing-v0``: one label of the whole action, permissible where both of `racing` are; (n,) bool."""
+    permissible: BoolArray = racing(obs, actions, next_obs).all(axis=1)
+    return permissible
+
+
 def steers_well(obs: Array, steering: Array, next_obs: Array) -> BoolArray:
     """Whether the steering, (n,), is permissible; see `racing`."""
     side = np.sign(next_obs[:, TRACK_POS])

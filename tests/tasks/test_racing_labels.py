@@ -16,6 +16,7 @@ from sb3_sap.tasks.racing import (
     free_view,
     lateral_speed,
     racing,
+    racing_whole,
 )
 from sb3_sap.tasks.racing import DIRECTIONS as OWN_DIRECTIONS
 from sb3_sap.tasks.racing import TRACK as OWN_TRACK
@@ -45,6 +46,14 @@ def test_parts_are_the_columns():
     labels = racing(observe(), np.zeros((1, 2)), observe())
     assert labels.shape == (1, 2)
     assert labels.dtype == bool
+
+
+def test_one_label_is_permissible_where_both_parts_are():
+    before, after = observe(speed=40, view=40), observe(speed=40, view=40)  # 20 m/s² to stop
+    actions = np.array([[0.0, 1.0], [0.0, -1.0]])
+    before, after = np.repeat(before, 2, axis=0), np.repeat(after, 2, axis=0)
+    assert racing(before, actions, after).tolist() == [[True, False], [True, True]]
+    assert racing_whole(before, actions, after).tolist() == [False, True]
 
 
 def test_entries_are_those_of_the_environment():

@@ -36,6 +36,11 @@ def test_the_goal_is_the_track_of_the_training_and_two_others_at_once(done, step
     assert steps_to_laps(laps_of(done)).tolist() == [steps]
 
 
+def test_of_one_track_the_goal_is_a_lap():
+    laps = laps_of({10: ["eroad"], 20: ["wheel-2"]})
+    assert steps_to_laps(laps[laps["track"] == "wheel-2"]).tolist() == [20]
+
+
 def test_the_page_counts_laps_and_tells_their_median_time(tmp_path):
     grid = make_grid(parse_configurations(["sac_ap:base+loss", "scripted"]), RACING, 40, range(3), TRACKS)
     assert [len(runs) for runs in grid.values()] == [3, 1]
@@ -82,6 +87,21 @@ def test_the_scripted_driver_is_a_run_of_the_benchmark():
 def test_the_report_of_races_is_for_racing(arguments, capsys):
     assert main(["benchmark", "task", *arguments]) != 0
     assert "The report 'races' is for sap/TorcsRacing-v0" in " ".join(capsys.readouterr().err.split())
+
+
+def test_tracks_are_for_racing(capsys):
+    assert main(["benchmark", "task", "Pendulum-v1", "--tracks", "spring"]) != 0
+    assert "--tracks is for sap/TorcsRacing-v0" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_tracks_of_a_race_can_be_chosen(tmp_path):
+    command = ["benchmark", "task", RACING, "--tracks", "g-track-3", "--out", str(tmp_path)]
+    assert main([*command, "--configurations", "scripted"]) == 0
+    folder = tmp_path / "TorcsRacing-v0-g-track-3"
+    assert pd.read_csv(folder / "races.csv")["track"].tolist() == ["g-track-3"]
+    page = (folder / "races.md").read_text(encoding="utf-8")
+    assert "*Steps until the goal* (a lap of g-track-3)" in page
+    assert "--configurations scripted --tracks g-track-3`" in page
 
 
 @pytest.mark.slow

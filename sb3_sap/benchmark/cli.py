@@ -50,6 +50,9 @@ def add_benchmark(commands: argparse._SubParsersAction[argparse.ArgumentParser])
         choices=["returns", "ways", "starts", "parts", "races"],
         help="the page that is written; None: races of sap/TorcsRacing-v0, else returns",
     )
+    command.add_argument(
+        "--tracks", nargs="+", metavar="TRACK", help="of sap/TorcsRacing-v0; None: that of its entry and four others"
+    )
     command.set_defaults(run=_with_extra(actions.task))
     command = added.add_parser("report", help="write all reports of lane keeping from the results that exist")
     _add_grid(command)

@@ -75,7 +75,9 @@ def task(options: argparse.Namespace, console: Console) -> int:
     from sb3_sap.benchmark.task_settings import COMPARED, EPISODES, planned_steps
 
     races = options.simulator == RACING
-    options.tracks = list(RACE_TRACKS if races else EPISODES)
+    if options.tracks and not races:
+        raise ValueError(f"--tracks is for {RACING}: the other tasks have no tracks, leave it out.")
+    options.tracks = options.tracks or list(RACE_TRACKS if races else EPISODES)
     options.report = options.report or ("races" if races else "returns")
     if races != (options.report == "races"):
         raise ValueError(f"The report 'races' is for {RACING}, and no other report is: leave --report out.")
@@ -203,8 +205,14 @@ def _grid(options: argparse.Namespace, steps: int, console: Console | None = Non
 def _folder(options: argparse.Namespace, steps: int) -> Path:
     # Runs of a task may differ in length, and the namespace of its id would be another folder.
     beyond = options.simulator not in ENVIRONMENTS
-    folder: Path = options.out / (options.simulator.rpartition("/")[2] if beyond else f"{options.simulator}-{steps}")
+    name = options.simulator.rpartition("/")[2] if beyond else f"{options.simulator}-{steps}"
+    folder: Path = options.out / "-".join([name, *(Path(track).stem for track in _tracks_of_races(options))])
     return folder
+
+
+def _tracks_of_races(options: argparse.Namespace) -> list[str]:
+    """The tracks of racing, unless they are those of its page."""
+    return options.tracks if options.simulator == RACING and options.tracks != list(RACE_TRACKS) else []
 
 
 def command_line(options: argparse.Namespace, name: str) -> str:
@@ -219,5 +227,6 @@ def command_line(options: argparse.Namespace, name: str) -> str:
         words += ["--reading", options.reading] if options.reading != "paper" else []
     elif options.configurations != (REPORTS[name][0] if name in REPORTS and not beyond else ["paper"]):
         words += ["--configurations", *options.configurations]
-    words += ["--tracks", *options.tracks] if not beyond and options.tracks != list(TEST_TRACKS) else []
+    tracks = _tracks_of_races(options) if beyond else options.tracks
+    words += ["--tracks", *tracks] if tracks and tracks != list(TEST_TRACKS) else []
     return shlex.join(words)

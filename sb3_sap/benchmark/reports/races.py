@@ -15,9 +15,7 @@ from sb3_sap.benchmark.reports.results import Results
 from sb3_sap.benchmark.reports.ways import run_scores
 from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
-#: The track of the training.
-TRAINING = "wheel-2"
-#: Tracks beside it that a driver who has learned to race laps.
+#: Tracks beside the first, on which it trains, that a driver who has learned to race laps.
 UNSEEN = 2
 #: Shares of the training after which the part of a lap is told.
 SHARES = (0.25, 0.5, 0.75, 1.0)
@@ -25,9 +23,8 @@ NOTE = (
     "All configurations of an algorithm share its base settings. `penalty=0` is the base algorithm. Each evaluation is "
     "one lap of each track from the grid, at rest, with the actor alone. *Part of a lap* is the mean over the tracks "
     "(without Spring, whose long lap is driven at the end only), as the interquartile mean over seeds with its 95 % "
-    f"bootstrap interval. *Steps until the goal* (laps of {TRAINING}, on which it trains, and of {UNSEEN} other tracks "
-    "in one evaluation) are medians over seeds, in which a run that never gets there counts as infinite, and the "
-    "number of seeds that do is in brackets. A track's column has the number of runs that lap it at the end, and the "
+    "bootstrap interval. *Steps until the goal* ({goal}) are medians over seeds, in which a run that never gets there "
+    "counts as infinite, and the number of seeds that do is in brackets. A track's column has the number of runs that lap it at the end, and the "
     "median of their lap times. *Mistakes* is the share of all training steps with a non-permissible part. "
     "Milliseconds per step are processor time.\n"
 )
@@ -44,18 +41,24 @@ def races(results: Results, folder: Path, command: str) -> None:
     rows = [_row(results, scores, name) for name in results.names]
     parts = ["![Part of a lap over training steps](races.svg)\n"] if learners else []
     table = pd.DataFrame(rows).fillna("")
-    write_page(folder / "races.md", "Racing", [*parts, markdown(table), NOTE], results, command)
+    first, *others = results.laps["track"].unique()
+    goal = f"laps of {first}, on which it trains, and of {UNSEEN} other tracks in one evaluation"
+    note = NOTE.format(goal=goal if len(others) >= UNSEEN else f"a lap of {first}")
+    write_page(folder / "races.md", "Racing", [*parts, markdown(table), note], results, command)
 
 
 def steps_to_laps(laps: pd.DataFrame) -> pd.Series:
-    """The first checkpoint at which the track of the training and `UNSEEN` others are lapped, else infinity.
+    """The first checkpoint at which the first track and `UNSEEN` others are lapped, else infinity.
 
-    The series is indexed by configuration and seed.
+    Where fewer tracks are driven, the first alone counts. The series is indexed by configuration and seed.
     """
-    done = laps.assign(done=laps["lap_done"].astype(bool), own=laps["track"] == TRAINING)
-    own = done[done["own"]].groupby(["configuration", "seed", "checkpoint"])["done"].any()
-    others = done[~done["own"]].groupby(["configuration", "seed", "checkpoint"])["done"].sum()
-    good = (own & (others >= UNSEEN)).rename("good").reset_index()
+    first, *others = laps["track"].unique()
+    done = laps.assign(done=laps["lap_done"].astype(bool), own=laps["track"] == first)
+    lapped = done.groupby(["configuration", "seed", "checkpoint", "own"])["done"].sum().unstack(fill_value=0)
+    good = lapped[True] > 0
+    if len(others) >= UNSEEN:
+        good &= lapped[False] >= UNSEEN
+    good = good.rename("good").reset_index()
     reached = good["checkpoint"].where(good["good"], math.inf)
     return reached.groupby([good["configuration"], good["seed"]]).min()
 

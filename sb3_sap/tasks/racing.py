@@ -83,7 +83,7 @@ def racing(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
 
 def racing_whole(obs: Array, actions: Array, next_obs: Array) -> BoolArray:
     """``sap/TorcsRacing-v0``: one label of the whole action, permissible where both of `racing` are; (n,) bool."""
-    permissible: BoolArray = racing(obs, actions, next_obs).all(axis=1)
+    permissible: BoolArray = np.all(racing(obs, actions, next_obs), axis=1)
     return permissible
 
 

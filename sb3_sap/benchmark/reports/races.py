@@ -24,9 +24,9 @@ NOTE = (
     "one lap of each track from the grid, at rest, with the actor alone. *Part of a lap* is the mean over the tracks "
     "(without Spring, whose long lap is driven at the end only), as the interquartile mean over seeds with its 95 % "
     "bootstrap interval. *Steps until the goal* ({goal}) are medians over seeds, in which a run that never gets there "
-    "counts as infinite, and the number of seeds that do is in brackets. A track's column has the number of runs that lap it at the end, and the "
-    "median of their lap times. *Mistakes* is the share of all training steps with a non-permissible part. "
-    "Milliseconds per step are processor time.\n"
+    "counts as infinite, and the number of seeds that do is in brackets. A track's column has the number of runs that "
+    "lap it at the end, and the median of their lap times. *Mistakes* is the share of all training steps with a "
+    "non-permissible part. Milliseconds per step are processor time.\n"
 )
 
 

@@ -13,7 +13,8 @@ from sb3_sap.benchmark.reports.results import collect
 from sb3_sap.benchmark.reports.returns import mean_returns, steps_to_return
 from sb3_sap.benchmark.runs import make_grid, make_run
 from sb3_sap.benchmark.store import write_result
-from sb3_sap.benchmark.task_settings import EPISODES, evaluations, parts_of, races_of, task_configurations
+from sb3_sap.benchmark.task_reports import parts_of, races_of, task_configurations
+from sb3_sap.benchmark.task_settings import EPISODES, evaluations
 from sb3_sap.benchmark.training import train_and_evaluate
 from sb3_sap.cli.main import main
 from sb3_sap.presets import load_config

@@ -72,7 +72,8 @@ def report(options: argparse.Namespace, console: Console) -> int:
 
 def task(options: argparse.Namespace, console: Console) -> int:
     """Makes the missing runs of a task beyond lane keeping and writes its page."""
-    from sb3_sap.benchmark.task_settings import COMPARED, EPISODES, planned_steps
+    from sb3_sap.benchmark.task_reports import COMPARED
+    from sb3_sap.benchmark.task_settings import EPISODES, planned_steps
 
     races = options.simulator == RACING
     if options.tracks and not races:

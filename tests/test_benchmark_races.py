@@ -68,6 +68,7 @@ def test_the_page_counts_laps_and_tells_their_median_time(tmp_path):
     assert learned["wheel-2"] == "2 of 3, 100.5 s"
     assert learned["steps until the goal"] == "20 (2)"
     assert learned["part of a lap after 10"] == "0.25 [0.25, 0.25]"
+    assert (learned["steps"], learned["part of a lap at the end"]) == ("40", "0.75 [0.25, 1.00]")
     assert (learned["mistakes"], learned["episodes lost"]) == ("25.0%", "1")
     assert (scripted["eroad"], scripted["steps until the goal"]) == ("1 of 1, 100.0 s", "")
     assert {path.name for path in tmp_path.glob("races*")} == {"races.md", "races.svg", "races.csv"}

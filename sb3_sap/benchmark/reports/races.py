@@ -17,16 +17,16 @@ from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 #: Tracks beside the first, on which it trains, that a driver who has learned to race laps.
 UNSEEN = 2
-#: Shares of the training after which the part of a lap is told.
-SHARES = (0.25, 0.5, 0.75, 1.0)
+#: Shares of the shortest training after which the part of a lap is told.
+SHARES = (0.25, 0.5)
 NOTE = (
     "All configurations of an algorithm share its base settings. `penalty=0` is the base algorithm. Each evaluation is "
     "one lap of each track from the grid, at rest, with the actor alone. *Part of a lap* is the mean over the tracks "
     "(without Spring, whose long lap is driven at the end only), as the interquartile mean over seeds with its 95 % "
-    "bootstrap interval. *Steps until the goal* ({goal}) are medians over seeds, in which a run that never gets there "
-    "counts as infinite, and the number of seeds that do is in brackets. A track's column has the number of runs that "
-    "lap it at the end, and the median of their lap times. *Mistakes* is the share of all training steps with a "
-    "non-permissible part. Milliseconds per step are processor time.\n"
+    "bootstrap interval, at the last evaluation until then. *Steps until the goal* ({goal}) are medians over seeds, in "
+    "which a run that never gets there counts as infinite, and the number of seeds that do is in brackets. A track's "
+    "column has the number of runs that lap it at the end, and the median of their lap times. *Mistakes* is the share "
+    "of all training steps with a non-permissible part. Milliseconds per step are processor time.\n"
 )
 
 
@@ -38,7 +38,8 @@ def races(results: Results, folder: Path, command: str) -> None:
     if learners:
         figure = line_figure(scores, learners, "checkpoint", "score", "training step", "part of a lap")
         write_figure(folder / "races.svg", figure)
-    rows = [_row(results, scores, name) for name in results.names]
+    shortest = min((scores[scores["configuration"] == name]["checkpoint"].max() for name in learners), default=0)
+    rows = [_row(results, scores, name, [share * shortest for share in SHARES]) for name in results.names]
     parts = ["![Part of a lap over training steps](races.svg)\n"] if learners else []
     table = pd.DataFrame(rows).fillna("")
     first, *others = results.laps["track"].unique()
@@ -63,20 +64,19 @@ def steps_to_laps(laps: pd.DataFrame) -> pd.Series:
     return reached.groupby([good["configuration"], good["seed"]]).min()
 
 
-def _row(results: Results, scores: pd.DataFrame, name: str) -> dict[str, str]:
+def _row(results: Results, scores: pd.DataFrame, name: str, points: list[float]) -> dict[str, str]:
     own = scores[scores["configuration"] == name]
     laps = results.laps[results.laps["configuration"] == name]
     last = laps["checkpoint"].max()
     row = {"configuration": name, "seeds": str(own["seed"].nunique())}
     if last > 0:
-        for share in SHARES:
-            at = own["checkpoint"][own["checkpoint"] <= share * last].max()
+        row["steps"] = f"{last:,}"
+        for title, point in [*((f"after {point:,.0f}", point) for point in points), ("at the end", last)]:
+            at = own["checkpoint"][own["checkpoint"] <= point].max()
             values = own[own["checkpoint"] == at]["score"].to_numpy()[:, None]
             if len(values):
                 low, high = bootstrap_interval(values)
-                row[f"part of a lap after {share * last:,.0f}"] = (
-                    f"{interquartile_mean(values):.2f} [{low:.2f}, {high:.2f}]"
-                )
+                row[f"part of a lap {title}"] = f"{interquartile_mean(values):.2f} [{low:.2f}, {high:.2f}]"
         median, number = median_reached(steps_to_laps(laps))
         row["steps until the goal"] = f"{median:,.0f} ({number})" if math.isfinite(median) else f"– ({number})"
     final = laps[laps["checkpoint"] == last]

@@ -3,9 +3,9 @@
     python measurements/racing_rewards.py progress crash gauge --seeds 100 --steps 15000
 
 - progress: the environment's own, metres along the centre line.
-- crash: the same, less 20 m where the car leaves the road, turns round or stands.
+- crash: the same, and -20 for the step with which the car leaves the road, turns round or has stood.
 - gauge: v (cos θ - |sin θ| - |d|) of each step, with θ the angle to the road and d the distance from the centre line in
-  half widths, the reward by which TORCS is often learned; and -20 for the same.
+  half widths, the reward by which TORCS is often learned; and -20 likewise.
 
 A row for every lap from the grid: the part of the track that was driven, and the time of a lap.
 """
@@ -24,6 +24,7 @@ from stable_baselines3.common.monitor import Monitor
 from sb3_sap.evaluation import make_env
 from sb3_sap.evaluation.racing import RACING, race
 from sb3_sap.presets import load_config
+from sb3_sap.tasks.racing import ANGLE, SPEED_X, TRACK_POS
 
 TRACKS = "wheel-2", "eroad", "g-track-3", "ole-road-1"
 #: Reward of an end before the lap is done; a step at 200 km/h earns 5.6.
@@ -44,7 +45,7 @@ class Reward(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.env.step(action)
         if self.kind == "gauge":
-            angle, track_pos, speed = obs[0], obs[20], obs[21] * 100 / 3.6
+            angle, track_pos, speed = obs[ANGLE], obs[TRACK_POS], obs[SPEED_X] * 100 / 3.6
             along = math.cos(angle) - abs(math.sin(angle)) - abs(track_pos)
             reward = speed * along * 0.1  # s, a control step
         if self.kind != "progress" and terminated:

@@ -1,10 +1,12 @@
 """Racing in the benchmark: laps from the grid, and their page."""
 
+import argparse
 import math
 
 import pandas as pd
 import pytest
 
+from sb3_sap.benchmark.commands import command_line
 from sb3_sap.benchmark.configurations import parse_configuration, parse_configurations
 from sb3_sap.benchmark.recorder import CURVE_COLUMNS, EPISODE_COLUMNS, TIME_COLUMNS
 from sb3_sap.benchmark.reports.races import races, steps_to_laps
@@ -103,6 +105,14 @@ def test_the_tracks_of_a_race_can_be_chosen(tmp_path):
     page = (folder / "races.md").read_text(encoding="utf-8")
     assert "*Steps until the goal* (a lap of g-track-3)" in page
     assert "--configurations scripted --tracks g-track-3`" in page
+
+
+@pytest.mark.parametrize("tracks", [["eroad", "spring", "g-track-3", "ole-road-1"], ["wheel-2"]])
+def test_the_command_of_a_page_names_the_tracks(tracks):
+    options = argparse.Namespace(
+        simulator=RACING, steps=40, seeds=1, first_seed=0, configurations=["scripted"], tracks=tracks
+    )
+    assert command_line(options, "races").endswith(f"--tracks {' '.join(tracks)}")
 
 
 @pytest.mark.slow

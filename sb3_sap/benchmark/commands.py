@@ -228,6 +228,6 @@ def command_line(options: argparse.Namespace, name: str) -> str:
         words += ["--reading", options.reading] if options.reading != "paper" else []
     elif options.configurations != (REPORTS[name][0] if name in REPORTS and not beyond else ["paper"]):
         words += ["--configurations", *options.configurations]
-    tracks = _tracks_of_races(options) if beyond else options.tracks
-    words += ["--tracks", *tracks] if tracks and tracks != list(TEST_TRACKS) else []
+    tracks = _tracks_of_races(options) if beyond else [] if options.tracks == list(TEST_TRACKS) else options.tracks
+    words += ["--tracks", *tracks] if tracks else []
     return shlex.join(words)

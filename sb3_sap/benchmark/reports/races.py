@@ -15,7 +15,7 @@ from sb3_sap.benchmark.reports.results import Results
 from sb3_sap.benchmark.reports.ways import run_scores
 from sb3_sap.evaluation.statistics import bootstrap_interval, interquartile_mean
 
-#: Tracks beside the first, on which it trains, that a driver who has learned to race laps.
+#: Tracks beside the first that a driver who has learned to race laps.
 UNSEEN = 2
 #: Shares of the shortest training after which the part of a lap is told.
 SHARES = (0.25, 0.5)
@@ -43,7 +43,7 @@ def races(results: Results, folder: Path, command: str) -> None:
     parts = ["![Part of a lap over training steps](races.svg)\n"] if learners else []
     table = pd.DataFrame(rows).fillna("")
     first, *others = results.laps["track"].unique()
-    goal = f"laps of {first}, on which it trains, and of {UNSEEN} other tracks in one evaluation"
+    goal = f"laps of {first} and of {UNSEEN} other tracks in one evaluation"
     note = NOTE.format(goal=goal if len(others) >= UNSEEN else f"a lap of {first}")
     write_page(folder / "races.md", "Racing", [*parts, markdown(table), note], results, command)
 
